@@ -1,0 +1,1 @@
+"""What one does with paths and spectra: beams, localisation, coverage, sensing, calibration."""

@@ -1,0 +1,234 @@
+"""Grids of directions: what a spectrum's pixels look at, in the device frame (x forward, y left, z up).
+
+Looking out of the array, row 0 is up and column 0 is left, so a spectrum and a photograph of the same pose overlay.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from rf3dgs.core.angles import angles_of, direction_of
+from rf3dgs.core.errors import InputError
+from rf3dgs.core.frames import CAMERA_FROM_DEVICE, Pose
+
+GridKind = Literal["pinhole", "equirect", "list"]
+
+
+@dataclass(frozen=True, eq=False)
+class DirectionGrid:
+    """Directions `[row, col, 3]` (unit vectors, device frame) and their solid angles `[row, col]` [sr].
+
+    `K` `[3, 3]` is the camera matrix in pixels of a pinhole grid, else None. A list of directions is one row whose
+    solid angles are given by whoever makes it (zero when unknown).
+    """
+
+    kind: GridKind
+    directions: Tensor
+    solid_angle: Tensor
+    K: Tensor | None = None
+
+    @property
+    def height(self) -> int:
+        return self.directions.shape[0]
+
+    @property
+    def width(self) -> int:
+        return self.directions.shape[1]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.height, self.width
+
+    @property
+    def spacing(self) -> float:
+        """The largest angle [rad] between neighbouring pixel centres, as seen where pixels are widest."""
+        if self.kind == "equirect":
+            return max(2 * math.pi / self.width, math.pi / self.height)
+        if self.K is not None:
+            return float(torch.atan(1.0 / torch.minimum(self.K[0, 0], self.K[1, 1])))
+        raise InputError("a list of directions has no pixel spacing; use a pinhole or equirectangular grid")
+
+    def same_as(self, other: "DirectionGrid") -> bool:
+        """True when both grids look in the same directions, pixel by pixel."""
+        same_shape = self.kind == other.kind and self.shape == other.shape
+        return same_shape and bool(torch.allclose(self.directions, other.directions, atol=1e-5))
+
+    def pixel_of(self, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixel coordinates `[*batch, 2]` as (x, y), centres at +0.5, of device-frame directions; and who is inside."""
+        if self.kind == "equirect":
+            zenith, azimuth = angles_of(directions)
+            x = (math.pi - azimuth) * (self.width / (2 * math.pi))
+            y = zenith * (self.height / math.pi)
+            return torch.stack((x, y), -1), torch.ones_like(x, dtype=torch.bool)
+        if self.K is None:
+            raise InputError("a list of directions has no pixels; use a pinhole or equirectangular grid")
+        camera = directions @ CAMERA_FROM_DEVICE.to(directions.dtype).mT
+        ahead = camera[..., 2] > 1e-9
+        depth = torch.where(ahead, camera[..., 2], torch.ones_like(camera[..., 2]))
+        x = self.K[0, 0] * camera[..., 0] / depth + self.K[0, 2]
+        y = self.K[1, 1] * camera[..., 1] / depth + self.K[1, 2]
+        inside = ahead & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        return torch.stack((x, y), -1), inside
+
+
+def pinhole_grid(width: int, height: int, fov_deg: float | None = None, *, K: Tensor | None = None) -> DirectionGrid:
+    """A pinhole grid from a horizontal field of view [deg] or from a camera matrix `K` `[3, 3]` [pixel].
+
+    Solid angles are exact integrals over each pixel's rectangle.
+    """
+    _check_size(width, height)
+    if (fov_deg is None) == (K is None):
+        raise InputError("pinhole_grid needs either fov_deg or K, not both and not neither")
+    if fov_deg is not None:
+        if not 0.0 < fov_deg < 180.0:
+            raise InputError(f"fov_deg must lie between 0 and 180 degrees; got {fov_deg}")
+        focal = 0.5 * width / math.tan(math.radians(fov_deg) / 2)
+        K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    assert K is not None
+    K = torch.as_tensor(K, dtype=torch.float32)
+    edge_x = (torch.arange(width + 1, dtype=torch.float64) - K[0, 2].double()) / K[0, 0].double()
+    edge_y = (torch.arange(height + 1, dtype=torch.float64) - K[1, 2].double()) / K[1, 1].double()
+    corner = torch.atan2(edge_x * edge_y[:, None], torch.sqrt(1 + edge_x**2 + edge_y[:, None] ** 2))
+    solid_angle = corner[1:, 1:] - corner[:-1, 1:] - corner[1:, :-1] + corner[:-1, :-1]
+    x = (torch.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
+    y = (torch.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
+    camera = torch.stack((x.expand(height, width), y[:, None].expand(height, width), torch.ones(height, width)), -1)
+    directions = torch.nn.functional.normalize(camera, dim=-1) @ CAMERA_FROM_DEVICE
+    return DirectionGrid("pinhole", directions, solid_angle.float(), K)
+
+
+def equirect_grid(width: int, height: int) -> DirectionGrid:
+    """The whole sphere: azimuth from +pi at the left edge down to -pi, zenith from 0 at the top to pi."""
+    _check_size(width, height)
+    azimuth = math.pi - (torch.arange(width) + 0.5) * (2 * math.pi / width)
+    zenith = (torch.arange(height) + 0.5) * (math.pi / height)
+    zenith_of_pixel, azimuth_of_pixel = torch.meshgrid(zenith, azimuth, indexing="ij")
+    edge = torch.arange(height + 1, dtype=torch.float64) * (math.pi / height)
+    band = (torch.cos(edge[:-1]) - torch.cos(edge[1:])) * (2 * math.pi / width)
+    solid_angle = band.float()[:, None].expand(height, width).contiguous()
+    return DirectionGrid("equirect", direction_of(zenith_of_pixel, azimuth_of_pixel), solid_angle)
+
+
+def list_grid(directions: Tensor, solid_angle: Tensor | None = None) -> DirectionGrid:
+    """A list of directions `[n, 3]` in the device frame as a grid of one row."""
+    directions = torch.nn.functional.normalize(torch.as_tensor(directions, dtype=torch.float32), dim=-1)
+    if directions.dim() != 2 or directions.shape[-1] != 3:
+        raise InputError(f"directions must be [direction, 3]; got {list(directions.shape)}")
+    weight = torch.zeros(len(directions)) if solid_angle is None else solid_angle
+    return DirectionGrid("list", directions[None], weight[None])
+
+
+def _check_size(width: int, height: int) -> None:
+    if width < 1 or height < 1:
+        raise InputError(f"a grid needs at least one pixel each way; got {width}x{height}")
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera: `viewmat` `[4, 4]` camera_from_world, `K` `[3, 3]` [pixel], picture `width` x `height`."""
+
+    viewmat: Tensor
+    K: Tensor
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, pose: Pose, grid: DirectionGrid) -> "Camera":
+        """The camera that sees what a pinhole `grid` sees at one `pose`."""
+        if grid.K is None:
+            raise InputError(f"a camera needs a pinhole grid; got {grid.kind}. Render other grids through cube faces")
+        return cls(pose.viewmat, grid.K, grid.width, grid.height)
+
+    @property
+    def pose(self) -> Pose:
+        return Pose.from_viewmat(self.viewmat)
+
+    @property
+    def position(self) -> Tensor:
+        """The camera's centre `[3]` in the world [m]."""
+        return -(self.viewmat[:3, :3].mT @ self.viewmat[:3, 3])
+
+    @property
+    def grid(self) -> DirectionGrid:
+        return pinhole_grid(self.width, self.height, K=self.K)
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same view with another number of pixels."""
+        scale = torch.tensor([width / self.width, height / self.height, 1.0])
+        return Camera(self.viewmat, scale[:, None] * self.K, width, height)
+
+
+FACE_FORWARD_UP = (
+    ((1, 0, 0), (0, 0, 1)),
+    ((0, 1, 0), (0, 0, 1)),
+    ((-1, 0, 0), (0, 0, 1)),
+    ((0, -1, 0), (0, 0, 1)),
+    ((0, 0, 1), (-1, 0, 0)),
+    ((0, 0, -1), (1, 0, 0)),
+)
+
+
+def face_grid(size: int, *, margin: int = 1) -> DirectionGrid:
+    """One cube face of `size` x `size` pixels over 90 degrees, with `margin` more pixels on every side.
+
+    The margin lets neighbouring faces overlap, so that interpolation needs no seam rules.
+    """
+    focal = 0.5 * size
+    centre = 0.5 * size + margin
+    K = torch.tensor([[focal, 0.0, centre], [0.0, focal, centre], [0.0, 0.0, 1.0]])
+    return pinhole_grid(size + 2 * margin, size + 2 * margin, K=K)
+
+
+def device_from_faces() -> Tensor:
+    """Rotations `[6, 3, 3]` from each face's own device frame to the device frame: front, left, back, right, up, down."""
+    forward = torch.tensor([face[0] for face in FACE_FORWARD_UP], dtype=torch.float32)
+    up = torch.tensor([face[1] for face in FACE_FORWARD_UP], dtype=torch.float32)
+    return torch.stack((forward, torch.linalg.cross(up, forward, dim=-1), up), -1)
+
+
+def face_cameras(pose: Pose, size: int, *, margin: int = 1) -> list[Camera]:
+    """The six cameras that see the whole sphere around one pose."""
+    grid = face_grid(size, margin=margin)
+    rotations = pose.world_from_device @ device_from_faces()
+    return [Camera.of(Pose.from_matrix(pose.position, rotation), grid) for rotation in rotations]
+
+
+def sample_grid(picture: Tensor, grid: DirectionGrid, directions: Tensor) -> Tensor:
+    """Bilinear values `[*batch, channel]` of a `[row, col, channel]` picture at device-frame directions.
+
+    Equirectangular pictures wrap around in azimuth and continue over the poles; outside a pinhole the edge is repeated.
+    """
+    pixel, _ = grid.pixel_of(directions)
+    height, width = grid.shape
+    x, y = pixel[..., 0] - 0.5, pixel[..., 1] - 0.5
+    x0, y0 = torch.floor(x), torch.floor(y)
+    fx, fy = (x - x0)[..., None], (y - y0)[..., None]
+    total = torch.zeros(())
+    for dx, wx in ((0, 1 - fx), (1, fx)):
+        for dy, wy in ((0, 1 - fy), (1, fy)):
+            col, row = (x0 + dx).long(), (y0 + dy).long()
+            if grid.kind == "equirect":
+                over_pole = (row < 0) | (row >= height)
+                row = torch.where(row < 0, -row - 1, torch.where(row >= height, 2 * height - 1 - row, row))
+                col = torch.where(over_pole, col + width // 2, col) % width
+            else:
+                row, col = row.clamp(0, height - 1), col.clamp(0, width - 1)
+            total = total + wx * wy * picture[row, col]
+    return total
+
+
+def sample_faces(faces: Tensor, size: int, directions: Tensor, *, margin: int = 1) -> Tensor:
+    """Values `[*batch, channel]` at device-frame directions of six face pictures `[6, row, col, channel]`."""
+    rotations = device_from_faces()
+    along = directions @ rotations[:, :, 0].mT
+    face = along.argmax(-1)
+    grid = face_grid(size, margin=margin)
+    result = faces.new_zeros(*directions.shape[:-1], faces.shape[-1])
+    for index in range(6):
+        chosen = face == index
+        local = directions[chosen] @ rotations[index]
+        result[chosen] = sample_grid(faces[index], grid, local)
+    return result

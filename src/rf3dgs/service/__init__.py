@@ -1,0 +1,1 @@
+"""A field behind an HTTP interface."""
