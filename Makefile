@@ -1,0 +1,66 @@
+# make demo   set everything up and run the main job on the built-in lobby
+# make test   set everything up and run the tests
+# make lint   formatting, types, import contract
+# make bench  speed of the splatting core, measured against its reference in the same run
+# make twin   trace, photograph and train the built-in lobby afresh: the data that ships inside the package
+#
+# Variables: PYTHON (3.11 to 3.13), VENV, and TORCH_INDEX, the package index torch comes from: name PyTorch's CPU index
+# for the small build, or one of its CUDA indexes for a GPU. Empty means pip's own configuration.
+
+PYTHON ?= python3
+VENV ?= .venv
+TORCH_INDEX ?=
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+SOURCES := $(shell find native -type f 2>/dev/null) CMakeLists.txt pyproject.toml constraints.txt
+OUT ?= out
+
+.PHONY: demo test test-slow lint format bench twin clean
+.DEFAULT_GOAL := demo
+
+$(BIN)/python:
+	@PYTHON="$(PYTHON)" tools/system-packages.sh run
+	"$(PYTHON)" -m venv $(VENV)
+	$(PIP) install -q -U "pip>=25.1"
+
+$(VENV)/torch.stamp: constraints.txt | $(BIN)/python
+	$(PIP) install -q -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
+	@touch $@
+
+$(VENV)/package.stamp: $(VENV)/torch.stamp $(SOURCES)
+	$(PIP) install -q -c constraints.txt -e .
+	@touch $@
+
+$(VENV)/test.stamp: $(VENV)/package.stamp
+	@PYTHON="$(PYTHON)" tools/system-packages.sh test
+	$(PIP) install -q -c constraints.txt -e ".[trace,sfm,mesh]" --group test --group lint
+	@touch $@
+
+demo: $(VENV)/package.stamp
+	$(BIN)/rf3dgs demo --out $(OUT)/demo
+
+test: $(VENV)/test.stamp
+	$(BIN)/python -m pytest -m "not slow and not gpu"
+
+test-slow: $(VENV)/test.stamp
+	$(BIN)/python -m pytest -m "slow and not gpu"
+
+lint: $(VENV)/test.stamp
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/pyright
+
+format: $(VENV)/test.stamp
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(VENV)/test.stamp
+	$(BIN)/python -m benchmarks.speed.step --json $(OUT)/bench.json
+	$(BIN)/python -m pytest benchmarks/speed --benchmark-only --benchmark-columns=min,median,rounds
+
+twin: $(VENV)/test.stamp
+	$(BIN)/python -m benchmarks.twin
+
+clean:
+	rm -rf build dist $(VENV) $(OUT)
