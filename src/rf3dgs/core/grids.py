@@ -183,7 +183,7 @@ def face_grid(size: int, *, margin: int = 1) -> DirectionGrid:
 
 
 def device_from_faces() -> Tensor:
-    """Rotations `[6, 3, 3]` from each face's own device frame to the device frame: front, left, back, right, up, down."""
+    """Rotations `[6, 3, 3]` from each face's frame to the device frame: front, left, back, right, up, down."""
     forward = torch.tensor([face[0] for face in FACE_FORWARD_UP], dtype=torch.float32)
     up = torch.tensor([face[1] for face in FACE_FORWARD_UP], dtype=torch.float32)
     return torch.stack((forward, torch.linalg.cross(up, forward, dim=-1), up), -1)

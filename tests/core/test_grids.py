@@ -1,0 +1,99 @@
+"""Laws of direction grids, cameras and cube faces."""
+
+import math
+
+import pytest
+import torch
+
+from rf3dgs.core.errors import InputError
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import (
+    Camera,
+    equirect_grid,
+    face_cameras,
+    face_grid,
+    list_grid,
+    pinhole_grid,
+    sample_faces,
+    sample_grid,
+)
+from rf3dgs.core.grids import device_from_faces as face_rotations
+
+LEFT = torch.tensor([0.0, 1.0, 0.0])
+UP = torch.tensor([0.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("grid", [pinhole_grid(60, 40, 90), equirect_grid(72, 36)])
+def test_left_is_column_zero_and_up_is_row_zero(grid) -> None:
+    assert bool(((grid.directions @ LEFT)[:, 0] > (grid.directions @ LEFT)[:, grid.width // 2]).all())
+    if grid.kind == "equirect":
+        front = grid.directions[grid.height // 2, grid.width // 4 : 3 * grid.width // 4] @ LEFT
+        assert bool((front[:-1] > front[1:]).all())
+    assert bool(((grid.directions @ UP)[0] > (grid.directions @ UP)[-1]).all())
+
+
+def test_the_sphere_has_four_pi_and_a_cube_face_a_sixth_of_it() -> None:
+    assert float(equirect_grid(180, 90).solid_angle.sum()) == pytest.approx(4 * math.pi, rel=1e-5)
+    assert float(pinhole_grid(32, 32, 90).solid_angle.sum()) == pytest.approx(4 * math.pi / 6, rel=1e-5)
+
+
+@pytest.mark.parametrize("grid", [pinhole_grid(30, 20, 90), equirect_grid(24, 12)])
+def test_pixel_of_a_pixel_direction_is_its_centre(grid) -> None:
+    pixel, inside = grid.pixel_of(grid.directions)
+    row, col = torch.meshgrid(torch.arange(grid.height), torch.arange(grid.width), indexing="ij")
+    torch.testing.assert_close(pixel, torch.stack((col, row), -1) + 0.5, atol=1e-3, rtol=0)
+    assert bool(inside.all())
+
+
+def test_what_is_behind_a_pinhole_is_outside() -> None:
+    _, inside = pinhole_grid(30, 20, 90).pixel_of(torch.tensor([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]))
+    assert inside.tolist() == [False, False, True]
+
+
+def test_a_camera_projects_a_point_where_its_grid_looks() -> None:
+    pose = Pose.look_at((1.0, 2.0, 1.5), (5.0, 4.0, 1.0))
+    camera = Camera.of(pose, pinhole_grid(64, 48, 80))
+    point = pose.position + 3.0 * pose.to_world(camera.grid.directions[10, 20])
+    seen = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
+    pixel = camera.K @ (seen / seen[2])
+    torch.testing.assert_close(pixel[:2], torch.tensor([20.5, 10.5]), atol=1e-3, rtol=0)
+    torch.testing.assert_close(camera.position, pose.position, atol=1e-5, rtol=0)
+    torch.testing.assert_close(camera.resized(32, 24).K[0, 0], camera.K[0, 0] / 2)
+
+
+def test_six_faces_cover_the_sphere_without_a_seam() -> None:
+    grid, face = equirect_grid(90, 45), face_grid(32)
+    faces = torch.stack([face.directions @ rotation.mT for rotation in face_rotations()])
+    torch.testing.assert_close(sample_faces(faces, 32, grid.directions), grid.directions, atol=2e-3, rtol=0)
+    rotations = face_rotations()
+    torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(6))
+
+
+def test_face_cameras_turn_with_the_pose() -> None:
+    pose = Pose.look_at((0.0, 0.0, 1.0), (1.0, 2.0, 1.5))
+    forward = torch.tensor([1.0, 0.0, 0.0])
+    cameras = face_cameras(pose, 16)
+    torch.testing.assert_close(cameras[1].pose.to_world(forward), pose.to_world(LEFT), atol=1e-5, rtol=0)
+    torch.testing.assert_close(cameras[4].pose.to_world(forward), pose.to_world(UP), atol=1e-5, rtol=0)
+
+
+def test_sampling_wraps_at_the_seam_and_over_the_poles() -> None:
+    grid = equirect_grid(64, 32)
+    sampled = sample_grid(
+        grid.directions, grid, torch.tensor([[-1.0, 1e-4, 0.0], [-1.0, -1e-4, 0.0], [0.0, 1e-4, 1.0]])
+    )
+    torch.testing.assert_close(sampled[0], sampled[1], atol=1e-3, rtol=0)
+    assert float(sampled[2] @ UP) > 0.99
+
+
+def test_bad_grids_are_refused() -> None:
+    with pytest.raises(InputError, match="fov_deg must lie between 0 and 180 degrees; got 200"):
+        pinhole_grid(10, 10, 200)
+    with pytest.raises(InputError, match="at least one pixel each way; got 0x5"):
+        equirect_grid(0, 5)
+    with pytest.raises(InputError, match="needs either fov_deg or K"):
+        pinhole_grid(10, 10)
+    with pytest.raises(InputError, match="a camera needs a pinhole grid; got equirect"):
+        Camera.of(Pose((0.0, 0.0, 0.0)), equirect_grid(8, 4))
+    with pytest.raises(InputError, match=r"directions must be \[direction, 3\]"):
+        list_grid(torch.zeros(3))
