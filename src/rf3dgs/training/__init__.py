@@ -1,0 +1,40 @@
+"""Training: photographs become Gaussians (the visual stage), spectra become a radio field on them (the radio stage)."""
+
+from typing import TYPE_CHECKING
+
+from rf3dgs.core.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from rf3dgs.training.checkpoint import CheckpointFolder as CheckpointFolder
+    from rf3dgs.training.checkpoint import State as State
+    from rf3dgs.training.config import RadioConfig as RadioConfig
+    from rf3dgs.training.config import VisualConfig as VisualConfig
+    from rf3dgs.training.loop import TrainingStopped as TrainingStopped
+    from rf3dgs.training.loop import train as train
+    from rf3dgs.training.radio import fit_radio as fit_radio
+    from rf3dgs.training.visual import fit_geometry as fit_geometry
+
+__all__ = [
+    "VisualConfig",
+    "fit_geometry",
+    "RadioConfig",
+    "fit_radio",
+    "train",
+    "TrainingStopped",
+    "State",
+    "CheckpointFolder",
+]
+
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "VisualConfig": ".config",
+        "fit_geometry": ".visual",
+        "RadioConfig": ".config",
+        "fit_radio": ".radio",
+        "train": ".loop",
+        "TrainingStopped": ".loop",
+        "State": ".checkpoint",
+        "CheckpointFolder": ".checkpoint",
+    },
+)
