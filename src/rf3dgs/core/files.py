@@ -1,7 +1,7 @@
 """Writing files and folders so that a reader never meets half of one.
 
-Everything is built under a hidden `.NAME.HEX.partial` name in the same folder, brought to the disk, and renamed into place.
-A process that is killed leaves only such a partial name behind, which `remove_partials` sweeps away.
+Everything is built under a hidden `.NAME.HEX.partial` name in the same folder, brought to the disk, and renamed into
+place. A process that is killed leaves only such a partial name behind, which `remove_partials` sweeps away.
 """
 
 import errno
@@ -22,8 +22,8 @@ _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPE
 def atomic_file(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path with the suffix of `path`; when the block ends well it becomes `path`, else it is removed.
 
-    The parent folder is made if need be. Raises DataError naming `path` when the disk is full, read-only or forbidden; an
-    older file of that name stays untouched then.
+    The parent folder is made if need be. Raises DataError naming `path` when the disk is full, read-only or forbidden;
+    an older file of that name stays untouched then.
     """
     path = Path(path)
     temporary = _partial(path, keep_suffix=True)
@@ -33,7 +33,7 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
         try:
             yield temporary
             _sync(temporary)
-            os.replace(temporary, path)
+            temporary.replace(path)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
@@ -44,8 +44,8 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Yield an empty temporary folder; when the block ends well it becomes `path`, else it is removed.
 
-    An older folder of that name is moved aside, replaced and then deleted. Raises DataError naming `path` as `atomic_file`
-    does, also where `path` is a file.
+    An older folder of that name is moved aside, replaced and then deleted. Raises DataError naming `path` as
+    `atomic_file` does, also where `path` is a file.
     """
     path = Path(path)
     temporary, old = _partial(path), _partial(path)

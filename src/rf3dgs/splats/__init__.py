@@ -1,0 +1,40 @@
+"""Gaussian splatting for photographs and spectra alike: the Gaussians, how they are drawn, grown, pruned and stored."""
+
+from typing import TYPE_CHECKING
+
+from rf3dgs.core.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from rf3dgs.splats.density import DensityState as DensityState
+    from rf3dgs.splats.gaussians import Gaussians as Gaussians
+    from rf3dgs.splats.image_loss import l1_ssim as l1_ssim
+    from rf3dgs.splats.image_loss import psnr as psnr
+    from rf3dgs.splats.image_loss import ssim as ssim
+    from rf3dgs.splats.ply import read_ply as read_ply
+    from rf3dgs.splats.ply import read_point_cloud as read_point_cloud
+    from rf3dgs.splats.ply import write_ply as write_ply
+    from rf3dgs.splats.raster import Raster as Raster
+    from rf3dgs.splats.rasterize import pick_backend as pick_backend
+    from rf3dgs.splats.rasterize import rasterize as rasterize
+    from rf3dgs.splats.reference import rasterize_reference as rasterize_reference
+    from rf3dgs.splats.surface import sample_mesh as sample_mesh
+    from rf3dgs.splats.transmittance import segment_transmittance as segment_transmittance
+
+_HOMES = {
+    "Gaussians": ".gaussians",
+    "Raster": ".raster",
+    "rasterize": ".rasterize",
+    "pick_backend": ".rasterize",
+    "rasterize_reference": ".reference",
+    "l1_ssim": ".image_loss",
+    "ssim": ".image_loss",
+    "psnr": ".image_loss",
+    "DensityState": ".density",
+    "sample_mesh": ".surface",
+    "segment_transmittance": ".transmittance",
+    "read_ply": ".ply",
+    "write_ply": ".ply",
+    "read_point_cloud": ".ply",
+}
+__all__ = list(_HOMES)
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)
