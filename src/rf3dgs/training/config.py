@@ -56,3 +56,70 @@ class RadioConfig:
     """Which rasterizer works."""
     checkpoint_every: int = 500
     """Iterations between checkpoints when a checkpoint folder is given."""
+
+
+@dataclass(frozen=True)
+class VisualConfig:
+    """The visual stage: photographs become Gaussians by 3D Gaussian Splatting.
+
+    Iteration counts that are None follow from `steps`: the published values for long runs, shares of the run for short
+    ones (`rf3dgs.training.schedule` has the rule).
+    """
+
+    steps: int = 30_000
+    """Iterations; each takes one photograph."""
+    seed: int = 0
+    """Decides the first Gaussians, the order of the photographs and how Gaussians split; the same seed gives the same
+    Gaussians, bit by bit, on one machine."""
+
+    start_count: int = 20_000
+    """How many random Gaussians to begin with when there are no points to begin from."""
+    bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    """Lowest and highest corner [m] of the box of the first Gaussians; None takes the cameras' box with a margin."""
+    max_count: int = 1_000_000
+    """Growth stops at this many Gaussians."""
+
+    double_at: tuple[int, int] | None = None
+    """Iterations at which the pictures' resolution, a quarter at first, doubles; None: 250 and 500, or 1/20 and 1/10 of
+    a short run."""
+    densify_from: int | None = None
+    """First iteration of growth; None: 500, or 1/10 of a short run."""
+    densify_until: int | None = None
+    """Growth ends here; None: half of the run."""
+    densify_every: int | None = None
+    """Iterations between growths; None: 100, or 1/50 of a short run."""
+    reset_every: int | None = None
+    """Iterations between resets of opacity while the population grows; None: 3,000; short runs have none."""
+    degree_every: int | None = None
+    """Iterations between degrees of the harmonics; None: 1,000, or 1/10 of a short run."""
+    degree: int = 3
+    """Highest degree of the colour's harmonics."""
+
+    grow_gradient: float = 2e-4
+    """Gaussians whose mean screen gradient (of the picture from -1 to 1) exceeds this are cloned or split."""
+    split_size: float = 0.01
+    """Of those, the ones larger than this share of the scene's extent are split, the others cloned."""
+    prune_opacity: float = 0.005
+    """Fainter Gaussians are removed."""
+    prune_size: float = 0.1
+    """Gaussians larger than this share of the scene's extent are removed."""
+
+    lr_means: float = 1.6e-4
+    """Adam's first learning rate of the means, as a share of the scene's extent."""
+    lr_means_final: float = 1.6e-6
+    """Their last one; it falls exponentially in between."""
+    lr_quats: float = 1e-3
+    """Adam's learning rate of the quaternions."""
+    lr_scales: float = 5e-3
+    """Adam's learning rate of the scales' logarithms."""
+    lr_opacities: float = 5e-2
+    """Adam's learning rate of the opacity logits."""
+    lr_sh: float = 2.5e-3
+    """Adam's learning rate of the constant harmonic; the higher ones learn at a twentieth of it."""
+    ssim_weight: float = 0.2
+    """Share of D-SSIM in the loss; the rest is L1."""
+
+    backend: Literal["auto", "native", "reference", "gsplat"] = "auto"
+    """Which rasterizer works."""
+    checkpoint_every: int = 1_000
+    """Iterations between checkpoints when a checkpoint folder is given."""
