@@ -20,21 +20,38 @@ if TYPE_CHECKING:
     from rf3dgs.splats.surface import sample_mesh as sample_mesh
     from rf3dgs.splats.transmittance import segment_transmittance as segment_transmittance
 
-_HOMES = {
-    "Gaussians": ".gaussians",
-    "Raster": ".raster",
-    "rasterize": ".rasterize",
-    "pick_backend": ".rasterize",
-    "rasterize_reference": ".reference",
-    "l1_ssim": ".image_loss",
-    "ssim": ".image_loss",
-    "psnr": ".image_loss",
-    "DensityState": ".density",
-    "sample_mesh": ".surface",
-    "segment_transmittance": ".transmittance",
-    "read_ply": ".ply",
-    "write_ply": ".ply",
-    "read_point_cloud": ".ply",
-}
-__all__ = list(_HOMES)
-__getattr__, __dir__ = lazy_names(__name__, _HOMES)
+__all__ = [
+    "Gaussians",
+    "Raster",
+    "rasterize",
+    "pick_backend",
+    "rasterize_reference",
+    "l1_ssim",
+    "ssim",
+    "psnr",
+    "DensityState",
+    "sample_mesh",
+    "segment_transmittance",
+    "read_ply",
+    "write_ply",
+    "read_point_cloud",
+]  # noqa: RUF022 (reading order)
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "Gaussians": ".gaussians",
+        "Raster": ".raster",
+        "rasterize": ".rasterize",
+        "pick_backend": ".rasterize",
+        "rasterize_reference": ".reference",
+        "l1_ssim": ".image_loss",
+        "ssim": ".image_loss",
+        "psnr": ".image_loss",
+        "DensityState": ".density",
+        "sample_mesh": ".surface",
+        "segment_transmittance": ".transmittance",
+        "read_ply": ".ply",
+        "write_ply": ".ply",
+        "read_point_cloud": ".ply",
+    },
+)

@@ -81,13 +81,13 @@ class Gaussians:
 
         `colours` `[point, channel]` in 0..1 become the degree-0 harmonics; without them all are mid-grey.
         """
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
         points = torch.as_tensor(points, dtype=torch.float32)
         if points.dim() != 2 or points.shape[1] != 3 or len(points) < 2 or not bool(torch.isfinite(points).all()):
             raise InputError(f"points must be at least two finite rows [point, 3]; got {list(points.shape)}")
         neighbours = min(4, len(points))
-        distance = cKDTree(points.numpy()).query(points.numpy(), k=neighbours)[0][:, 1:]
+        distance = KDTree(points.numpy()).query(points.numpy(), k=neighbours)[0][:, 1:]
         scale = np.clip(np.sqrt(np.mean(distance**2, axis=1)), 1e-4, None)
         sh = torch.zeros(len(points), coefficient_count(degree), channels)
         if colours is not None:
