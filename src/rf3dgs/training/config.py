@@ -1,4 +1,4 @@
-"""What a person may choose about training: frozen dataclasses without torch, which the command line shows as they are."""
+"""What a person may choose about training: frozen dataclasses without torch, which the command line shows as is."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -103,7 +103,12 @@ class VisualConfig:
     """Fainter Gaussians are removed."""
     prune_size: float = 0.1
     """Gaussians larger than this share of the scene's extent are removed."""
+    prune_unseen: float = 1.0
+    """Gaussians whose blending weights over all photographs sum to less than this many pixels are removed, three times
+    during growth and at the end."""
 
+    background: Literal["random", "black"] = "random"
+    """Behind the Gaussians: another colour in every iteration, which teaches surfaces to be opaque, or black."""
     lr_means: float = 1.6e-4
     """Adam's first learning rate of the means, as a share of the scene's extent."""
     lr_means_final: float = 1.6e-6

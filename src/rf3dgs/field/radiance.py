@@ -1,0 +1,183 @@
+"""What a surface sends to a receiver: the paper's model, harmonics in a dB window on frozen Gaussians.
+
+Pure functions of arrays that training and rendering share, and `Surface`, which only remembers. A picture of a surface
+has the channels
+
+    0      gain in the field's dB window, 0 at the floor, composited over an empty (zero) background
+    1      accumulated weight sum T alpha
+    2..    CSI, composited: delay [ns] and departure vector (encoding "vector"), or the paper's own three channels
+
+and `decode` makes power, delay and departure of it. The line of sight is not here: see `field.sources`.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rf3dgs.core.errors import InputError
+from rf3dgs.core.grids import Camera
+from rf3dgs.core.units import SPEED_OF_LIGHT
+from rf3dgs.spectra.codec import DbWindow, PaperEncoding
+from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.splats.harmonics import basis, view_directions
+from rf3dgs.splats.rasterize import rasterize
+
+NANOSECOND = 1e-9
+CSI_CHANNELS = {"vector": 4, "paper": 3}
+CSI_DEGREE = {"vector": 1, "paper": 3}
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Gaussians that send radio power: geometry, harmonics and the window they are expressed in.
+
+    means `[N, 3]` [m], quats `[N, 4]`, log_scales `[N, 3]`, logit_opacities `[N]`: as in `Gaussians`, without colour.
+    gain_sh `[N, K]`: the gain in window units is 0.5 + SH(view direction), not below 0.
+    csi_sh: encoding "vector" `[N, 4, 4]`, degree 1: residuals of the delay [ns] and the departure (world x, y, z) over
+        the single-bounce prior; encoding "paper" `[N, 16, 3]`, degree 3: its three channels as 0.5 + SH.
+    tx `[3]`: the transmitter's position [m], for the prior.
+    """
+
+    means: Tensor
+    quats: Tensor
+    log_scales: Tensor
+    logit_opacities: Tensor
+    gain_sh: Tensor
+    csi_sh: Tensor
+    tx: Tensor
+    window: DbWindow
+    encoding: str = "vector"
+
+    def __post_init__(self) -> None:
+        if self.encoding not in CSI_CHANNELS:
+            raise InputError(f'encoding must be "vector" or "paper"; got {self.encoding!r}')
+        count = len(self.means)
+        csi = (count, (CSI_DEGREE[self.encoding] + 1) ** 2, CSI_CHANNELS[self.encoding])
+        if self.gain_sh.dim() != 2 or len(self.gain_sh) != count or self.gain_sh.shape[1] not in (1, 4, 9, 16):
+            raise InputError(f"gain_sh must be [{count}, 1|4|9|16]; got {list(self.gain_sh.shape)}")
+        if tuple(self.csi_sh.shape) != csi:
+            raise InputError(f"csi_sh must be {list(csi)} for {self.encoding!r}; got {list(self.csi_sh.shape)}")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def scales(self) -> Tensor:
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        return torch.sigmoid(self.logit_opacities)
+
+    @classmethod
+    def bare(cls, geometry: Gaussians, *, tx: Tensor, window: DbWindow, encoding: str = "vector", degree: int = 3):
+        """The surface before any spectrum is seen: all harmonics zero, so that every Gaussian is at mid-window."""
+        count = len(geometry)
+        if encoding not in CSI_CHANNELS:
+            raise InputError(f'encoding must be "vector" or "paper"; got {encoding!r}')
+        csi_shape = (count, (CSI_DEGREE[encoding] + 1) ** 2, CSI_CHANNELS[encoding])
+        return cls(
+            geometry.means.detach(),
+            geometry.quats.detach(),
+            geometry.log_scales.detach(),
+            geometry.logit_opacities.detach(),
+            torch.zeros(count, (degree + 1) ** 2),
+            torch.zeros(csi_shape),
+            torch.as_tensor(tx, dtype=torch.float32),
+            window,
+            encoding,
+        )
+
+    def select(self, index: Tensor) -> "Surface":
+        """The surface of some of the Gaussians; differentiable in the harmonics and opacities."""
+        names = ("means", "quats", "log_scales", "logit_opacities", "gain_sh", "csi_sh")
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
+
+
+def in_view(means: Tensor, reach: Tensor, camera: Camera) -> Tensor:
+    """Indices of the Gaussians that may touch the picture: `means` `[N, 3]`, `reach` `[N]` their radius [m].
+
+    Conservative: a ball of that radius meets the pyramid of view. Geometry is frozen, so this needs no gradient.
+    """
+    x, y, z = (means @ camera.viewmat[:3, :3].mT + camera.viewmat[:3, 3]).unbind(-1)
+    keep = z > -reach
+    for across, focal, centre, size in (
+        (x, camera.K[0, 0], camera.K[0, 2], camera.width),
+        (y, camera.K[1, 1], camera.K[1, 2], camera.height),
+    ):
+        low, high = float(centre / focal), float((size - centre) / focal)
+        keep &= (across - high * z) < reach * (1 + high * high) ** 0.5
+        keep &= (-across - low * z) < reach * (1 + low * low) ** 0.5
+    return keep.nonzero().squeeze(-1)
+
+
+def reach_of(scales: Tensor) -> Tensor:
+    """Radius [m] beyond which a Gaussian `[N, 3]` of full opacity falls below 1/255, with room for the dilation."""
+    return 3.5 * scales.amax(-1) + 0.05
+
+
+def gain_values(gain_sh: Tensor, directions: Tensor) -> Tensor:
+    """Gain `[N, 1]` in window units that Gaussians with `gain_sh` `[N, K]` show along `[N, 3]`."""
+    degree = int(gain_sh.shape[1] ** 0.5) - 1
+    return ((basis(directions, degree) * gain_sh).sum(-1, keepdim=True) + 0.5).clamp_min(0.0)
+
+
+def csi_prior(means: Tensor, tx: Tensor, centre: Tensor) -> Tensor:
+    """Delay [ns] and departure vector `[N, 4]` of the single bounce transmitter -> Gaussian -> receiver."""
+    outward = means - tx
+    first = torch.linalg.vector_norm(outward, dim=-1, keepdim=True)
+    second = torch.linalg.vector_norm(means - centre, dim=-1, keepdim=True)
+    delay = (first + second) / (SPEED_OF_LIGHT * NANOSECOND)
+    return torch.cat((delay, outward / first.clamp_min(1e-6)), -1)
+
+
+def csi_values(surface: Surface, centre: Tensor, directions: Tensor) -> Tensor:
+    """CSI channels `[N, 4]` (vector) or `[N, 3]` (paper) of each Gaussian for a receiver at `centre`."""
+    learned = torch.einsum("nk,nkc->nc", basis(directions, CSI_DEGREE[surface.encoding]), surface.csi_sh)
+    if surface.encoding == "paper":
+        return (learned + 0.5).clamp_min(0.0)
+    return csi_prior(surface.means, surface.tx, centre) + learned
+
+
+def picture_of(surface: Surface, camera: Camera, *, csi: bool = True, backend: str = "auto") -> Tensor:
+    """The channels `[row, col, 2 + CSI]` described above, without gradients; `csi=False` gives the first two alone."""
+    with torch.no_grad():
+        seen = surface.select(in_view(surface.means, reach_of(surface.scales), camera))
+        directions = view_directions(seen.means, camera.position)
+        values = gain_values(seen.gain_sh, directions)
+        if csi:
+            values = torch.cat((values, csi_values(seen, camera.position, directions)), -1)
+        raster = rasterize(seen.means, seen.quats, seen.scales, seen.opacities, values, camera, backend=backend)
+    return torch.cat((raster.values[..., :1], raster.weight[..., None], raster.values[..., 1:]), -1)
+
+
+@dataclass(frozen=True, eq=False)
+class Radiance:
+    """What a surface sends per direction: power `[*shape]` (linear), and delay `[*shape]` [s] and departure
+    `[*shape, 3]` (unit vector, world) where they were asked for; both are zero where nothing is hit.
+    """
+
+    power: Tensor
+    delay: Tensor | None = None
+    aod: Tensor | None = None
+
+
+def decode(channels: Tensor, surface: Surface) -> Radiance:
+    """Physical values of composited channels `[*shape, 2 (+ CSI)]`; interpolate channels, not what this returns."""
+    power = surface_power(channels[..., 0], surface.window)
+    if channels.shape[-1] == 2:
+        return Radiance(power)
+    if surface.encoding == "paper":
+        delay, aod = PaperEncoding.of_field(surface.window).decode(channels[..., 0], channels[..., 2:])
+        return Radiance(power, delay, aod)
+    weight = channels[..., 1]
+    hit = weight > 1e-3
+    delay = torch.where(hit, channels[..., 2] / weight.clamp_min(1e-3) * NANOSECOND, torch.zeros_like(weight))
+    aod = torch.nn.functional.normalize(channels[..., 3:6], dim=-1, eps=1e-9) * hit[..., None]
+    return Radiance(power, delay, aod)
+
+
+def surface_power(value: Tensor, window: DbWindow) -> Tensor:
+    """Linear power of a composited gain in window units; zero at the floor and below, the ceiling at most."""
+    return torch.where(value > 0, window.decode(value.clamp(0.0, 1.0)), torch.zeros_like(value))

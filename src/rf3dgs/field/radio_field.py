@@ -1,0 +1,186 @@
+"""`RadioField`: the learned model of which power arrives from where, how late, and how it left the transmitter.
+
+A field is a sum of parts in linear power: what the surface sends (`field.radiance`) and point sources
+(`field.sources`).
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from rf3dgs.channel.paths import Paths
+from rf3dgs.core.angles import angles_of
+from rf3dgs.core.errors import InputError
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import Camera, DirectionGrid, equirect_grid, face_cameras, sample_faces
+from rf3dgs.field.radiance import Radiance, Surface, decode, picture_of
+from rf3dgs.field.sources import Blockers, PointSource
+from rf3dgs.spectra.peaks import find_peaks
+from rf3dgs.spectra.spectrum import Instrument, Spectrum
+
+
+@dataclass(frozen=True, eq=False)
+class RadioField:
+    """A radio radiance field of one transmitter at one frequency.
+
+    surface: the Gaussians that scatter. solidity `[N]`: their opacity to rays as the geometry has it, 0..1, which
+    decides what hides a point source. sources: the point sources, the line of sight first; may be empty.
+    frequency [Hz]; instrument: what its training spectra were taken with, and so what it renders.
+    tx: the transmitter's pose, given or estimated. bounds `[2, 3]`: low and high corner of the training positions [m].
+    colour `[N, 3]` uint8: how a viewer paints the Gaussians. meta: free text about the run (seed, versions, steps).
+    """
+
+    surface: Surface
+    sources: tuple[PointSource, ...]
+    solidity: Tensor
+    frequency: float
+    instrument: Instrument
+    tx: Pose
+    bounds: Tensor
+    colour: Tensor
+    meta: dict[str, str | int | float | bool] = field(default_factory=dict)
+    backend: str = "auto"
+
+    @property
+    def blockers(self) -> Blockers:
+        """The Gaussians as obstacles."""
+        return Blockers(self.surface.means, self.surface.quats, self.surface.scales, self.solidity)
+
+    def covers(self, pose: Pose, *, margin: float = 0.5) -> Tensor:
+        """True `[*batch]` for receivers in the box of the training positions, widened by `margin` [m]."""
+        inside = (pose.position >= self.bounds[0] - margin) & (pose.position <= self.bounds[1] + margin)
+        return inside.all(-1)
+
+    def sees_transmitter(self, pose: Pose) -> Tensor:
+        """True `[*batch]` where the line of sight is a part of this field and open."""
+        if not self.sources:
+            return torch.zeros(pose.batch_shape, dtype=torch.bool)
+        return self.sources[0].visible(pose.position, self.blockers)
+
+    def render(self, pose: Pose, grid: DirectionGrid, *, csi: bool = True) -> Spectrum:
+        """The spectrum at one pose or a batch `[*batch]`: linear power, and delay [s] and departure per direction.
+
+        Pinhole grids are rasterized as they are, others through six cube faces of the grid's own pixel size.
+        `csi=False` leaves delay and departure out, which is faster.
+        """
+        batch = pose.batch_shape
+        flat = Pose(pose.position.reshape(-1, 3), pose.orientation.reshape(-1, 4))
+        if len(flat) == 0:
+            raise InputError("render needs at least one pose; got an empty batch")
+        parts = [self._render_one(flat[index], grid, csi) for index in range(len(flat))]
+        power = torch.stack([part.power for part in parts]).reshape(*batch, *grid.shape)
+        delay = aod = None
+        if csi:
+            delay = torch.stack([part.delay for part in parts if part.delay is not None]).reshape(power.shape)
+            aod = torch.stack([part.aod for part in parts if part.aod is not None]).reshape(*power.shape, 3)
+        return Spectrum(power, grid, pose, self.frequency, self.instrument, "field", delay, aod, self.tx)
+
+    def paths(self, pose: Pose, *, strongest: int = 8) -> Paths:
+        """The strongest paths `[*batch, strongest]` at one pose or a batch, strongest first.
+
+        A point source in sight gives its exact arrival, departure, delay D / c and gain. Every other path is a peak
+        of the surface's spectrum: its gain is the power in the beam there, its delay and departure are those of the
+        pixel. `coeff` is real and positive: the carrier's phase is the caller's choice in `cfr` and `cir`. `order` is
+        0 for the line of sight and 1 for peaks of the surface, whose number of bounces a field does not know.
+        """
+        if strongest < 1:
+            raise InputError(f"strongest must be at least 1; got {strongest}")
+        flat = Pose(pose.position.reshape(-1, 3), pose.orientation.reshape(-1, 4))
+        rows = [self._paths_of_one(flat[index], strongest) for index in range(len(flat))]
+        table = torch.stack(rows).reshape(*pose.batch_shape, strongest, 9)
+        aoa_zenith, aoa_azimuth = angles_of(table[..., 2:5])
+        aod_zenith, aod_azimuth = angles_of(table[..., 5:8])
+        return Paths(
+            coeff=table[..., 0].clamp_min(0).sqrt().to(torch.complex64),
+            delay=table[..., 1],
+            aoa_zenith=aoa_zenith,
+            aoa_azimuth=aoa_azimuth,
+            aod_zenith=aod_zenith,
+            aod_azimuth=aod_azimuth,
+            valid=table[..., 0] > 0,
+            frequency=self.frequency,
+            tx=self.tx,
+            rx=pose,
+            order=table[..., 8].round().long(),
+        )
+
+    def without_sources(self) -> "RadioField":
+        """The surface alone."""
+        return replace(self, sources=())
+
+    def save(self, path: str | Path) -> None:
+        """Write the folder `path` (NAME.field); see `field.io.save_field`."""
+        from rf3dgs.field.io import save_field
+
+        save_field(self, path)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "RadioField":
+        """Read a folder written by `save`; raises DataError naming the file that is wrong."""
+        from rf3dgs.field.io import load_field
+
+        return load_field(path)
+
+    def _render_one(self, pose: Pose, grid: DirectionGrid, csi: bool) -> Radiance:
+        surface = decode(self._channels(pose, grid, csi), self.surface)
+        if not self.sources:
+            return surface
+        directions = pose.to_world(grid.directions)
+        power, delay, aod = surface.power, surface.delay, surface.aod
+        weighted_delay = None if delay is None else surface.power * delay
+        weighted_aod = None if aod is None else surface.power[..., None] * aod
+        for source in self.sources:
+            if not bool(source.visible(pose.position, self.blockers)):
+                continue
+            beam = source.beam(directions, pose.position, self.instrument)
+            share = beam * source.gain(pose.position, self.frequency)
+            power = power + share
+            if weighted_delay is not None and weighted_aod is not None:
+                weighted_delay = weighted_delay + share * source.delay(pose.position)
+                weighted_aod = weighted_aod + share[..., None] * source.departure(pose.position)
+        if weighted_delay is None or weighted_aod is None:
+            return Radiance(power)
+        reached = power > 0
+        delay = torch.where(reached, weighted_delay / torch.where(reached, power, 1.0), torch.zeros_like(power))
+        scale = torch.where(reached, power, 1.0)[..., None]
+        return Radiance(power, delay, torch.nn.functional.normalize(weighted_aod / scale, dim=-1, eps=1e-9))
+
+    def _channels(self, pose: Pose, grid: DirectionGrid, csi: bool) -> Tensor:
+        if grid.kind == "pinhole":
+            return picture_of(self.surface, Camera.of(pose, grid), csi=csi, backend=self.backend)
+        spacing = grid.spacing if grid.kind == "equirect" else 0.5 * self.instrument.lobe
+        size = max(8, math.ceil(0.5 * math.pi / spacing - 1e-3))
+        faces = [picture_of(self.surface, camera, csi=csi, backend=self.backend) for camera in face_cameras(pose, size)]
+        return sample_faces(torch.stack(faces), size, grid.directions)
+
+    def _paths_of_one(self, pose: Pose, strongest: int) -> Tensor:
+        """Rows `[strongest, 9]`: gain, delay, arrival (3), departure (3), order; a row of zero gain is padding."""
+        rows = []
+        for order, source in enumerate(self.sources):
+            if bool(source.visible(pose.position, self.blockers)):
+                at = pose.position
+                head = torch.stack((source.gain(at, self.frequency), source.delay(at)))
+                rows.append(
+                    torch.cat((head, source.arrival(at), source.departure(at), torch.tensor([min(order, 1.0)])))
+                )
+        lobe = self.instrument.lobe
+        width = min(360, max(72, 4 * math.ceil(0.5 * math.pi / (lobe / 1.5))))
+        grid = equirect_grid(width, width // 2)
+        surface = self.without_sources()._render_one(pose, grid, True)
+        assert surface.delay is not None
+        assert surface.aod is not None
+        directions, gains = find_peaks(surface.power, grid, count=strongest, separation=lobe)
+        (x, y), _ = (value.unbind(-1) if value.dim() > 1 else value for value in grid.pixel_of(directions))
+        row, col = y.long().clamp(0, grid.height - 1), x.long().clamp(0, grid.width - 1)
+        found = (
+            torch.stack((gains, surface.delay[row, col]), -1),
+            pose.to_world(directions),
+            surface.aod[row, col],
+            torch.ones(len(gains), 1),
+        )
+        table = torch.cat((*[row[None] for row in rows], torch.cat(found, -1)))
+        table = table[table[:, 0].argsort(descending=True, stable=True)][:strongest]
+        return torch.cat((table, torch.zeros(strongest - len(table), 9)))
