@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
+import h5py.h5o
 import numpy as np
 
 from rf3dgs.core.errors import DataError
@@ -51,7 +52,7 @@ def open_audited(path: str | Path, *, max_bytes: int = 8 * 2**30) -> h5py.File:
 
 def read_array(group: h5py.Group, name: str) -> np.ndarray:
     """The whole dataset `name` of an audited file; a missing or damaged one is a `DataError` that names the file."""
-    path, where = group.file.filename, f"{group.name.rstrip('/')}/{name}"
+    path, where = group.file.filename, f"{group.name or ''}/{name}".replace("//", "/")
     dataset = group.get(name)
     if not isinstance(dataset, h5py.Dataset):
         raise DataError(f"{path}: expected the dataset {where!r}; it is missing")
@@ -61,14 +62,17 @@ def read_array(group: h5py.Group, name: str) -> np.ndarray:
         raise DataError(f"{path}: {where!r} is damaged (checksum or storage); write the file again") from error
 
 
-def read_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str | float | int | np.ndarray:
+def read_attribute(item: h5py.HLObject, name: str) -> str | float | int | np.ndarray:
     """One attribute as text, number or small array; a missing one is a `DataError` that names file and object."""
     if name not in item.attrs:
         raise DataError(f"{item.file.filename}: {item.name!r} lacks the attribute {name!r}; write the file again")
     value = item.attrs[name]
     if isinstance(value, bytes):
         return value.decode("utf-8", errors="replace")
-    return value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, str):
+        return value
+    array = np.asarray(value)
+    return array.item() if array.ndim == 0 else array
 
 
 def _audit(file: h5py.File, path: Path, max_bytes: int) -> None:
@@ -87,9 +91,9 @@ def _audit(file: h5py.File, path: Path, max_bytes: int) -> None:
 
 def _objects(file: h5py.File, path: Path) -> Iterator[tuple[str, h5py.Group | h5py.Dataset]]:
     """Every object once, parents first, following hard links only."""
-    pending: list[tuple[str, h5py.Group, int]] = [("/", file["/"], 0)]
-    seen = {h5py.h5o.get_info(file["/"].id).addr}
-    yield "/", file["/"]
+    pending: list[tuple[str, h5py.Group, int]] = [("/", file, 0)]
+    seen = {h5py.h5o.get_info(file.id).addr}
+    yield "/", file
     while pending:
         prefix, group, depth = pending.pop()
         if depth > MAX_DEPTH:

@@ -1,0 +1,95 @@
+"""Splitting receiver positions into train, validation, test at random, and a held-out region behind a buffer."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from rf3dgs.core.errors import InputError
+
+ROLES = ("train", "validation", "test", "region", "buffer")
+SEALED_ROLES = ("test", "region")
+SAME_PLACE = 1e-3  # [m] closer positions are one place
+
+
+def split_positions(
+    positions: Tensor,
+    *,
+    test: float = 0.15,
+    validation: float = 0.1,
+    region: float = 0.15,
+    buffer: float = 0.3,
+    seed: int = 0,
+) -> tuple[str, ...]:
+    """A role for each position `[n, 3]` [m], the same for the same seed.
+
+    "region" is the share `region` of the places inside an upright cylinder around a place drawn at random; the places
+    up to `buffer` [m] around it are "buffer" and serve nothing, so that no neighbour gives the region away. Of all
+    places the shares `test` and `validation` are drawn at random from the rest, and what remains is "train". Positions
+    closer than 1 mm (several orientations at one place) are one place and share one role.
+    """
+    positions = torch.as_tensor(positions, dtype=torch.float32)
+    if positions.dim() != 2 or positions.shape[-1] != 3:
+        raise InputError(f"positions must be [position, 3] in metres; got {list(positions.shape)}")
+    shares = {"test": test, "validation": validation, "region": region}
+    for name, share in shares.items():
+        if not 0.0 <= share < 1.0:
+            raise InputError(f"the share {name} must lie in [0, 1); got {share}")
+    if sum(shares.values()) >= 1.0 or buffer < 0.0:
+        raise InputError(f"test + validation + region must stay below 1, buffer >= 0; got {shares}, buffer {buffer}")
+    place, first = places_of(positions)
+    count = len(first)
+    centre = positions[first].double().numpy()[:, :2]
+    random = np.random.default_rng(seed)
+    role = np.full(count, "train", dtype=object)
+    held = round(region * count)
+    if held > 0:
+        distance = np.linalg.norm(centre - centre[random.integers(count)], axis=1)
+        radius = np.sort(distance)[held - 1]
+        role[distance <= radius + buffer] = "buffer"
+        role[distance <= radius] = "region"
+    free = random.permutation(np.flatnonzero(role == "train"))
+    tested, validated = round(test * count), round(validation * count)
+    role[free[:tested]] = "test"
+    role[free[tested : tested + validated]] = "validation"
+    if not (role == "train").any():
+        raise InputError(f"no place of {count} is left for training; lower test, validation, region or buffer")
+    return tuple(str(role[index]) for index in place)
+
+
+def check_roles(positions: Tensor, roles: Sequence[str]) -> None:
+    """Refuse unknown roles, other counts, and one place (positions closer than 1 mm) on two sides of the split."""
+    if len(roles) != len(positions):
+        raise InputError(f"expected one role per position, {len(positions)}; got {len(roles)} roles")
+    unknown = sorted(set(roles) - set(ROLES))
+    if unknown:
+        raise InputError(f"roles must be among {', '.join(ROLES)}; got {', '.join(unknown)}")
+    place, first = places_of(positions)
+    for index, which in enumerate(place):
+        other = int(first[which])
+        if roles[index] != roles[other]:
+            raise InputError(
+                f"positions {other} and {index} are the same place (closer than 1 mm), but one is {roles[other]!r} and "
+                f"the other {roles[index]!r}; give both one role, or the test is no test"
+            )
+
+
+def places_of(positions: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """The place of each position `[n]`, and the first position of each place `[m]`; places are 1 mm apart or more."""
+    points = torch.as_tensor(positions).double().numpy()
+    pairs = KDTree(points).query_pairs(SAME_PLACE, output_type="ndarray")
+    near = coo_array((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(points),) * 2)
+    _, label = connected_components(near, directed=False)
+    _, first, place = np.unique(label, return_index=True, return_inverse=True)
+    return place, first
+
+
+def every_kth(count: int, k: int) -> tuple[str, ...]:
+    """Roles of `count` photos: every `k`-th is "test", the others "train"; `k` 0 keeps all for training."""
+    if k < 0 or k == 1:
+        raise InputError(f"every k-th photo is tested, so k must be 0 (none) or at least 2; got {k}")
+    return tuple("test" if k and index % k == k - 1 else "train" for index in range(count))
