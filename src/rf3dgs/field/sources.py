@@ -30,7 +30,7 @@ class Blockers:
 
 @dataclass(frozen=True, eq=False)
 class PointSource:
-    """A source at `position` `[3]` [m] of waves that leave the transmitter at `tx` `[3]`: one point for the line of sight.
+    """A source at `position` `[3]` [m]; its waves leave the transmitter at `tx` `[3]`, the same for the line of sight.
 
     gain_db: level over Friis' free-space gain between isotropic antennas. open_above: the transmittance of the
     segment to the receiver above which the source is seen.
@@ -80,10 +80,10 @@ class PointSource:
 def fit_line_of_sight(source: PointSource, spectra: Spectrum) -> tuple[PointSource, Tensor]:
     """The source with its level fitted to `spectra` `[position, row, col]`, and where the spectra see it `[position]`.
 
-    At each position the beam's power is what stands within half a lobe of the source's direction over the median of the
-    ring around it (2 to 4 lobes), solved for by least squares; a position sees the source when that power lies 3 dB
-    over the ring and within 6 dB of the median level over Friis of such positions. That median is the fitted level. When no
-    position sees the source it keeps its level and nothing is seen.
+    At each position the beam's power is what stands within half a lobe of the source's direction over the median of
+    the ring around it (2 to 4 lobes), solved for by least squares. A position sees the source when that power lies 3 dB
+    over the ring and within 6 dB of the median level over Friis of such positions; that median is the fitted level.
+    When no position sees the source it keeps its level.
     """
     excess, over_ring = [], []
     centre = spectra.pose.position
