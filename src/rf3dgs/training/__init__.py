@@ -11,12 +11,14 @@ if TYPE_CHECKING:
     from rf3dgs.training.config import VisualConfig as VisualConfig
     from rf3dgs.training.loop import TrainingStopped as TrainingStopped
     from rf3dgs.training.loop import train as train
+    from rf3dgs.training.photographs import render_photo as render_photo
     from rf3dgs.training.radio import fit_radio as fit_radio
     from rf3dgs.training.visual import fit_geometry as fit_geometry
 
-__all__ = [
+__all__ = [  # noqa: RUF022 (reading order)
     "VisualConfig",
     "fit_geometry",
+    "render_photo",
     "RadioConfig",
     "fit_radio",
     "train",
@@ -30,6 +32,7 @@ __getattr__, __dir__ = lazy_names(
     {
         "VisualConfig": ".config",
         "fit_geometry": ".visual",
+        "render_photo": ".photographs",
         "RadioConfig": ".config",
         "fit_radio": ".radio",
         "train": ".loop",

@@ -6,12 +6,14 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
+from rf3dgs.splats.density import Change
+
 
 class Adam:
     """Adam (Kingma and Ba 2015) for a dictionary of leaf tensors, with a learning rate by name in every step.
 
-    `parameters` is shared with its owner, who may replace a tensor when `first` and `second`, its moments, are replaced
-    with it. Bias correction counts the steps of the whole run, as 3D Gaussian Splatting does for Gaussians born late.
+    `first` and `second` are the moments. Bias correction counts the steps of the whole run, as 3D Gaussian Splatting
+    does for Gaussians born late.
     """
 
     def __init__(self, parameters: dict[str, Tensor], *, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
@@ -44,14 +46,11 @@ class Adam:
                 parameter.grad = None
         self.count += 1
 
-    def gather(self, source: Tensor) -> None:
-        """Rows after a change of population: row i continues row `source[i]`, or starts afresh where that is -1."""
-        fresh = source < 0
-        for moments in (self.first, self.second):
-            for name, value in moments.items():
-                rows = value[source.clamp_min(0)]
-                rows[fresh] = 0.0
-                moments[name] = rows
+    def follow(self, change: Change, parameters: dict[str, Tensor]) -> None:
+        """Take over the parameters of a changed population; the moments follow, and are zero for fresh rows."""
+        self.parameters = parameters
+        self.first = {name: change.follow(moment) for name, moment in self.first.items()}
+        self.second = {name: change.follow(moment) for name, moment in self.second.items()}
 
     def forget(self, name: str) -> None:
         """Zero the moments of one parameter, after its values were set from outside."""

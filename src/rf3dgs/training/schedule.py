@@ -1,0 +1,77 @@
+"""When things happen in the visual stage: the published iterations for long runs, shares of the run for short ones."""
+
+from dataclasses import dataclass
+
+from rf3dgs.core.errors import InputError
+from rf3dgs.training.config import VisualConfig
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Iterations of the visual stage, all resolved; see `VisualConfig` for their meaning."""
+
+    steps: int
+    double_at: tuple[int, int]
+    densify_from: int
+    densify_until: int
+    densify_every: int
+    reset_every: int
+    degree_every: int
+    degree: int
+    lr_means: float
+    lr_means_final: float
+
+    @classmethod
+    def of(cls, config: VisualConfig) -> "Schedule":
+        """The schedule of a configuration; raises `InputError` for counts that make no sense."""
+        steps = config.steps
+        if steps < 1 or config.max_count < 1 or config.start_count < 1:
+            raise InputError(
+                f"steps, start_count and max_count must be at least 1; got {steps}, {config.start_count}, "
+                f"{config.max_count}"
+            )
+
+        def chosen(value: int | None, published: int, share: int) -> int:
+            return max(1, min(published, steps // share)) if value is None else max(1, value)
+
+        return cls(
+            steps=steps,
+            double_at=config.double_at or (min(250, steps // 20), min(500, steps // 10)),
+            densify_from=chosen(config.densify_from, 500, 10),
+            densify_until=steps // 2 if config.densify_until is None else config.densify_until,
+            densify_every=chosen(config.densify_every, 100, 50),
+            reset_every=chosen(config.reset_every, 3_000, 1) if steps >= 9_000 or config.reset_every else steps + 1,
+            degree_every=chosen(config.degree_every, 1_000, 10),
+            degree=config.degree,
+            lr_means=config.lr_means,
+            lr_means_final=config.lr_means_final,
+        )
+
+    def shrink_at(self, iteration: int) -> int:
+        """How many times smaller than the photograph the picture of an iteration is: 4, 2 or 1."""
+        return 4 if iteration < self.double_at[0] else 2 if iteration < self.double_at[1] else 1
+
+    def degree_at(self, iteration: int) -> int:
+        """The degree of the colour's harmonics in an iteration."""
+        return min(self.degree, iteration // self.degree_every)
+
+    def means_rate(self, iteration: int) -> float:
+        """The means' learning rate as a share of the scene's extent: exponential between its two ends."""
+        share = iteration / max(1, self.steps - 1)
+        return self.lr_means * (self.lr_means_final / self.lr_means) ** share
+
+    def densifies_after(self, iteration: int) -> bool:
+        """Whether the population changes after an iteration."""
+        done = iteration + 1
+        return self.densify_from <= done <= self.densify_until and done % self.densify_every == 0
+
+    def resets_after(self, iteration: int) -> bool:
+        """Whether opacity is reset after an iteration."""
+        done = iteration + 1
+        return done < self.densify_until and done % self.reset_every == 0
+
+    def prunes_unseen_after(self, iteration: int) -> bool:
+        """Whether Gaussians that no photograph shows are removed after an iteration: thrice, and at the end."""
+        done = iteration + 1
+        span = max(1, self.densify_until - self.densify_from)
+        return done == self.steps or done in {self.densify_from + span * part // 3 for part in (1, 2, 3)}
