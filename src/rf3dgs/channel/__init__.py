@@ -1,0 +1,40 @@
+"""Channels: paths, the arrays that receive them, and what they respond."""
+
+from typing import TYPE_CHECKING
+
+from rf3dgs.core.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from rf3dgs.channel.arrays import PlanarArray as PlanarArray
+    from rf3dgs.channel.arrays import ofdm as ofdm
+    from rf3dgs.channel.arrays import planar_array as planar_array
+    from rf3dgs.channel.binning import bin_diffuse as bin_diffuse
+    from rf3dgs.channel.binning import stack_paths as stack_paths
+    from rf3dgs.channel.io import PathsReader as PathsReader
+    from rf3dgs.channel.io import PathsWriter as PathsWriter
+    from rf3dgs.channel.io import load_paths as load_paths
+    from rf3dgs.channel.io import save_paths as save_paths
+    from rf3dgs.channel.paths import Paths as Paths
+    from rf3dgs.channel.patterns import power_pattern as power_pattern
+    from rf3dgs.channel.response import cfr as cfr
+    from rf3dgs.channel.response import cir as cir
+    from rf3dgs.channel.response import manifold as manifold
+
+_HOMES = {
+    "Paths": ".paths",
+    "planar_array": ".arrays",
+    "PlanarArray": ".arrays",
+    "ofdm": ".arrays",
+    "power_pattern": ".patterns",
+    "manifold": ".response",
+    "cfr": ".response",
+    "cir": ".response",
+    "bin_diffuse": ".binning",
+    "stack_paths": ".binning",
+    "save_paths": ".io",
+    "load_paths": ".io",
+    "PathsWriter": ".io",
+    "PathsReader": ".io",
+}
+__all__ = list(_HOMES)
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

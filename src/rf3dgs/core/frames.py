@@ -234,3 +234,13 @@ def yaw_pitch_roll_from_quaternion(orientation: Tensor) -> tuple[float, float, f
     if abs(float(m[2, 0])) < 1.0 - 1e-9:
         return math.atan2(m[1, 0], m[0, 0]), pitch, math.atan2(m[2, 1], m[2, 2])
     return math.atan2(-m[0, 1], m[1, 1]), pitch, 0.0
+
+
+def mitsuba_from_viewmat(viewmat: Tensor) -> Tensor:
+    """The Mitsuba sensor-to-world matrix `[*batch, 4, 4]` (x left, y up, z forward) of `camera_from_world`."""
+    rotation = viewmat[..., :3, :3].mT
+    position = -(rotation @ viewmat[..., :3, 3:])
+    flip = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=viewmat.dtype))
+    top = torch.cat((rotation @ flip, position), -1)
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=viewmat.dtype).expand(*top.shape[:-2], 1, 4)
+    return torch.cat((top, bottom), -2)

@@ -1,6 +1,7 @@
 """`Spectrum`: what an instrument sees, power per direction."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -92,3 +93,27 @@ class Spectrum:
 
     def __len__(self) -> int:
         return self.power.shape[0] if self.pose.batch_shape else 1
+
+
+def stack_spectra(spectra: Sequence[Spectrum]) -> Spectrum:
+    """One spectrum `[n, row, col]` of n spectra `[row, col]` or `[1, row, col]` that share grid and instrument."""
+    if not spectra:
+        raise InputError("there are no spectra to stack")
+    first = spectra[0]
+    if not all(spectrum.grid.same_as(first.grid) for spectrum in spectra):
+        raise InputError("spectra on different grids cannot be stacked; resample them to one grid first")
+    shape = first.grid.shape
+
+    def joined(values: list[Tensor | None], *tail: int) -> Tensor | None:
+        present = [value.reshape(-1, *tail) for value in values if value is not None]
+        return torch.cat(present) if len(present) == len(spectra) else None
+
+    power = joined([spectrum.power for spectrum in spectra], *shape)
+    assert power is not None
+    pose = Pose(
+        torch.cat([spectrum.pose.position.reshape(-1, 3) for spectrum in spectra]),
+        torch.cat([spectrum.pose.orientation.reshape(-1, 4) for spectrum in spectra]),
+    )
+    delay = joined([spectrum.delay for spectrum in spectra], *shape)
+    aod = joined([spectrum.aod for spectrum in spectra], *shape, 3)
+    return replace(first, power=power, pose=pose, delay=delay, aod=aod)
