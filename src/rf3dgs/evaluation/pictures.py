@@ -1,0 +1,161 @@
+"""Pictures of spectra: colours in NumPy, PNG and JPEG bytes, files written whole or not at all."""
+
+import io
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from rf3dgs.core.angles import angles_of
+from rf3dgs.core.errors import InputError
+from rf3dgs.evaluation.metrics import window_picture
+from rf3dgs.spectra.codec import DbWindow, window_of
+from rf3dgs.spectra.spectrum import Spectrum
+
+# Anchors at equal steps, dark blue over green to yellow: even steps look even, also in grey print.
+LEVEL_COLOURS = np.array(
+    [
+        *((68, 1, 84), (72, 36, 117), (65, 68, 135), (53, 95, 141), (42, 120, 142), (33, 145, 140)),
+        *((34, 168, 132), (68, 191, 112), (122, 209, 81), (189, 223, 38), (253, 231, 37)),
+    ],
+    dtype=float,
+)
+DIFFERENCE_COLOURS = np.array([(33, 102, 172), (146, 197, 222), (247, 247, 247), (244, 165, 130), (178, 24, 43)], float)
+NOTHING = np.array([222, 224, 228], dtype=np.uint8)  # where no path arrives
+
+
+def coloured(value: np.ndarray, anchors: np.ndarray = LEVEL_COLOURS) -> np.ndarray:
+    """uint8 `[*shape, 3]` colours of values in [0, 1] `[*shape]`, interpolated between the anchors; clipped."""
+    steps = np.linspace(0.0, 1.0, len(anchors))
+    channels = [np.interp(np.clip(value, 0.0, 1.0), steps, anchors[:, channel]) for channel in range(3)]
+    return np.stack(channels, -1).round().astype(np.uint8)
+
+
+def hues(turn: np.ndarray) -> np.ndarray:
+    """uint8 `[*shape, 3]` colours of a cyclic value `[*shape]` that comes round at every integer."""
+    phase = 2.0 * np.pi * (turn[..., None] - np.array([0.0, 1.0, 2.0]) / 3.0)
+    return (255.0 * (0.5 + 0.42 * np.cos(phase))).round().astype(np.uint8)
+
+
+def spectrum_picture(spectrum: Spectrum, window: DbWindow | None = None) -> np.ndarray:
+    """The level in the dB window as a uint8 `[row, col, 3]` picture, row 0 up and column 0 left.
+
+    The window's floor is dark blue and its ceiling yellow; by default the window is the spectrum's own.
+    """
+    _one(spectrum)
+    window = window_of(spectrum) if window is None else window
+    return coloured(window_picture(spectrum.power, window).numpy())
+
+
+def difference_picture(truth: Spectrum, prediction: Spectrum, window: DbWindow, *, span_db: float = 20.0) -> np.ndarray:
+    """Predicted minus true level, both clipped to the window: uint8 `[row, col, 3]`, red too strong, blue too weak.
+
+    The colours end at plus and minus `span_db`.
+    """
+    gap = window_picture(prediction.power, window) - window_picture(truth.power, window)
+    gap_db = gap.numpy() * (window.ceil_db - window.floor_db)
+    return coloured(0.5 + 0.5 * gap_db / span_db, DIFFERENCE_COLOURS)
+
+
+def delay_picture(spectrum: Spectrum, window: DbWindow, *, longest: float) -> np.ndarray:
+    """Delays from 0 to `longest` [s] as uint8 `[row, col, 3]`; grey below the window's floor."""
+    if spectrum.delay is None:
+        raise InputError("this spectrum has no delays to draw")
+    return _masked(coloured(spectrum.delay.numpy() / longest), spectrum, window)
+
+
+def departure_pictures(spectrum: Spectrum, window: DbWindow) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuth (cyclic hues) and zenith of the angle of departure as uint8 `[row, col, 3]`; grey below the floor."""
+    if spectrum.aod is None:
+        raise InputError("this spectrum has no angles of departure to draw")
+    zenith, azimuth = angles_of(spectrum.aod)
+    turn = azimuth.numpy() / (2 * np.pi)
+    return _masked(hues(turn), spectrum, window), _masked(coloured(zenith.numpy() / np.pi), spectrum, window)
+
+
+def _masked(picture: np.ndarray, spectrum: Spectrum, window: DbWindow) -> np.ndarray:
+    below = (spectrum.gain_db < window.floor_db).numpy()
+    return np.where(below[..., None], NOTHING, picture)
+
+
+def photo_picture(photo: np.ndarray | torch.Tensor) -> np.ndarray:
+    """uint8 `[row, col, 3]` of a photograph in [0, 1] `[row, col, 3]`; clipped."""
+    values = photo.detach().numpy() if isinstance(photo, torch.Tensor) else np.asarray(photo)
+    if values.ndim != 3 or values.shape[2] != 3:
+        raise InputError(f"a photograph must be [row, col, 3] with values from 0 to 1; got shape {list(values.shape)}")
+    return (255.0 * np.clip(values, 0.0, 1.0)).round().astype(np.uint8)
+
+
+def encoded(picture: np.ndarray, kind: str = "PNG") -> bytes:
+    """The bytes of a PNG or JPEG file of a uint8 `[row, col, 3]` picture."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    options = {"quality": 88} if kind == "JPEG" else {"optimize": True}
+    Image.fromarray(np.ascontiguousarray(picture)).save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+def save_png(path: str | Path, picture: np.ndarray) -> None:
+    """Write a uint8 `[row, col, 3]` picture as PNG, whole or not at all."""
+    write_whole(path, encoded(picture))
+
+
+def save_spectrum_figure(
+    spectrum: Spectrum, path: str | Path, *, window: DbWindow | None = None, title: str = ""
+) -> None:
+    """Write the spectrum as a PNG figure with axes in degrees and a colour bar in dB."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+    from matplotlib.figure import Figure
+
+    from rf3dgs.evaluation.panels import axis_ticks
+
+    _one(spectrum)
+    window = window_of(spectrum) if window is None else window
+    height, width = spectrum.grid.shape
+    figure = Figure(figsize=(8.0, 1.6 + 6.4 * min(height / width, 1.2)), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.imshow(
+        spectrum_picture(spectrum, window), interpolation="nearest", extent=(0, width, height, 0), aspect="equal"
+    )
+    across, down = axis_ticks(spectrum.grid)
+    axes.set_xticks([place for place, _ in across], [text for _, text in across])
+    axes.set_yticks([place for place, _ in down], [text for _, text in down])
+    axes.set_xlabel("azimuth [deg], left is positive")
+    axes.set_ylabel("zenith [deg]")
+    axes.set_title(title)
+    colours = LinearSegmentedColormap.from_list("level", LEVEL_COLOURS / 255.0)
+    scale = ScalarMappable(Normalize(window.floor_db, window.ceil_db), colours)
+    figure.colorbar(scale, ax=axes, label="power [dB]", shrink=0.85)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    write_whole(path, buffer.getvalue())
+
+
+def write_whole(path: str | Path, content: bytes) -> None:
+    """Write `content` to a temporary file beside `path` and move it into place, so that no half file is ever seen."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def _one(spectrum: Spectrum) -> None:
+    if spectrum.pose.batch_shape:
+        raise InputError(
+            f"a picture shows one pose; got {list(spectrum.pose.batch_shape)}. Choose one, as in spectrum[0]"
+        )
