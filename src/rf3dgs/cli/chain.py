@@ -1,0 +1,182 @@
+"""The steps of the main job, composed from the layers: what `demo` runs in one go and other commands one by one."""
+
+import math
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from rf3dgs.channel.paths import Paths
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import DirectionGrid
+from rf3dgs.core.progress import Progress
+from rf3dgs.data.dataset import Dataset, Part
+from rf3dgs.data.photo import Photo
+from rf3dgs.evaluation.protocol import evaluate
+from rf3dgs.evaluation.report import PhotoPair, ReportInputs, SpectrumExample
+from rf3dgs.evaluation.table import Evaluation
+from rf3dgs.propagation.config import PhotoConfig, TraceConfig
+from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
+from rf3dgs.spectra.synthesis import spectrum_of
+from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.splats.harmonics import view_values
+from rf3dgs.splats.rasterize import rasterize
+from rf3dgs.splats.surface import sample_mesh
+
+if TYPE_CHECKING:
+    from rf3dgs.field.radio_field import RadioField
+    from rf3dgs.propagation.scene import Scene
+
+REPEAT_SEED = 100_003
+REPEAT_RAYS = 5 / 3  # the second solve shoots this many times the rays: a lattice of its own
+
+
+def spectra_of_scene(
+    scene: "Scene", rx: Pose, grid: DirectionGrid, config: TraceConfig, progress: Progress
+) -> Spectrum:
+    """Trace every receiver and keep its ideal spectrum; the paths themselves are dropped, so memory stays flat."""
+    from rf3dgs.propagation.sionna import trace_each
+
+    def spectrum(paths: Paths) -> Spectrum:
+        return spectrum_of(paths, None, grid, method="ideal")
+
+    return stack_spectra([spectrum(paths) for paths in trace_each(scene, scene.tx, rx, config, progress)])
+
+
+def photograph(
+    scene: "Scene", count: int, seed: int, config: PhotoConfig, folder: Path, progress: Progress
+) -> list[Photo]:
+    """Render a tour of the scene into JPEG files in `folder`."""
+    from PIL import Image
+
+    from rf3dgs.propagation.photographer import camera_tour, render_photos
+
+    cameras = camera_tour(scene, count, seed, config)
+    photos = []
+    for number, picture in enumerate(render_photos(scene, cameras, config, progress)):
+        name = f"{number:05d}.jpg"
+        Image.fromarray(picture).save(folder / name, quality=92)
+        photos.append(Photo(name, cameras[number], folder / name))
+    return photos
+
+
+def make_dataset(
+    scene: "Scene",
+    folder: Path,
+    grid: DirectionGrid,
+    *,
+    receivers: int,
+    photos: int,
+    trace: TraceConfig,
+    photo: PhotoConfig,
+    seed: int,
+    progress: Progress,
+) -> Dataset:
+    """Trace and photograph a scene and write the split dataset, with a second solve of its held-out positions."""
+    rx = scene.receivers(receivers, seed)
+    spectra = spectra_of_scene(scene, rx, grid, trace, progress)
+    split = Dataset((), spectra).split(seed=seed)
+    index = torch.cat((split.where("test"), split.where("region")))
+    again = replace(trace, seed=trace.seed + REPEAT_SEED, rays=round(trace.rays * REPEAT_RAYS))
+    repeat = spectra_of_scene(scene, rx[index], grid, again, progress)
+    meta = {
+        "generator": f"scene {scene.name}, {trace.rays} rays, depth {trace.depth}; {photos} photographs",
+        "seed": seed,
+        "repeat": {"rays": again.rays, "seed": again.seed},
+    }
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as temporary:
+        pictures = photograph(scene, photos, seed, photo, Path(temporary), progress) if photos else []
+        whole = Dataset(pictures, spectra, repeat=repeat, repeat_index=index, meta=meta)
+        return whole.split(seed=seed).save(folder)
+
+
+def geometry_of_mesh(scene: "Scene", count: int, seed: int) -> Gaussians:
+    """Flattened Gaussians on the scene's meshes, painted in their colours."""
+    vertices, faces, colour = scene.mesh()
+    return sample_mesh(vertices, faces, count=count, seed=seed, colour=colour)
+
+
+def photo_pairs(geometry: Gaussians, photos: Sequence[Photo]) -> list[PhotoPair]:
+    """Held-out photographs beside their renderings."""
+    pairs = []
+    with torch.no_grad():
+        for photo in photos:
+            values = view_values(geometry.sh, geometry.means, photo.camera.position, offset=0.5, clamp=True)
+            raster = rasterize(
+                geometry.means, geometry.quats, geometry.scales, geometry.opacities, values, photo.camera
+            )
+            pairs.append(PhotoPair(photo.name, photo.load(), raster.values.clamp(0, 1)))
+    return pairs
+
+
+def evaluate_parts(
+    field: "RadioField", train: Spectrum, parts: dict[str, Part], progress: Progress, seed: int
+) -> dict[str, Evaluation]:
+    """Score the field on every hold-out that has spectra."""
+    return {
+        name: evaluate(field, part.spectra, train=train, repeat=part.repeat, holdout=name, seed=seed, progress=progress)
+        for name, part in parts.items()
+        if part.spectra is not None and len(part.spectra)
+    }
+
+
+def report_inputs(
+    title: str,
+    field: "RadioField",
+    dataset: Dataset,
+    parts: dict[str, Part],
+    evaluations: dict[str, Evaluation],
+    *,
+    geometry: Gaussians | None = None,
+    footprint: Sequence = (),
+    timings: dict[str, float] | None = None,
+    seed: int = 0,
+    command: str = "",
+) -> ReportInputs:
+    """What the report shows, with one example position of each hold-out in the middle of its errors."""
+    train = dataset.train.spectra
+    assert train is not None
+    examples = []
+    for name, evaluation in evaluations.items():
+        spectra = parts[name].spectra
+        assert spectra is not None
+        order = evaluation.column("field", "rmse_db").argsort()
+        place = int(order[len(order) // 2])
+        where = ", ".join(f"{value:.1f}" for value in spectra.pose.position[place].tolist())
+        label = f"hold-out {name}, receiver at ({where}) m, the one with the median RMSE"
+        examples.append(SpectrumExample.of(label, field, spectra[place], train))
+    held_out = [photo for photo, role in zip(dataset.photos, dataset.photo_roles, strict=False) if role == "test"]
+    facts = {
+        "Frequency": f"{field.frequency / 1e9:g} GHz",
+        "Training": f"{len(train)} positions, {len(dataset.train.photos)} photographs",
+        "Instrument": field.instrument.name,
+        "Grid": f"{train.grid.kind}, {train.grid.width} x {train.grid.height}",
+        "Gaussians": f"{len(field.surface):,}",
+        "Transmitter": "(" + ", ".join(f"{value:.2f}" for value in field.tx.position.tolist()) + ") m",
+        "dB window": f"{field.window.floor_db:.1f} to {field.window.ceil_db:.1f} dB",
+        "Path gain at the training positions": _range_db(train),
+    }
+    return ReportInputs(
+        title=title,
+        evaluations=evaluations,
+        facts=facts,
+        photos=photo_pairs(geometry, held_out[:4]) if geometry is not None else (),
+        examples=examples,
+        positions=dataset.pose.position,
+        roles=dataset.roles,
+        tx=field.tx.position,
+        footprint=footprint,
+        timings=timings or {},
+        seed=seed,
+        command=command,
+        window=field.window,
+    )
+
+
+def _range_db(spectra: Spectrum) -> str:
+    low, high = (10 * math.log10(float(value)) for value in (spectra.path_gain.min(), spectra.path_gain.max()))
+    return f"{low:.1f} to {high:.1f} dB"

@@ -1,0 +1,67 @@
+"""`rf3dgs`: finds the command, runs it, and turns an error of ours into one sentence and an exit status."""
+
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+
+from rf3dgs import __version__
+from rf3dgs.cli.ask import Csi, Render, View
+from rf3dgs.cli.check import Doctor, Info, Validate
+from rf3dgs.cli.demo import Demo
+from rf3dgs.cli.fit import Fit, FitGeometry, FitRadio
+from rf3dgs.cli.judge import Eval
+from rf3dgs.cli.make import MakePhotos, MakeSpectra, Trace
+from rf3dgs.core.errors import RfError
+
+name = tyro.conf.subcommand
+Command = (
+    Annotated[Demo, name("demo")]
+    | Annotated[Trace, name("trace")]
+    | Annotated[MakePhotos, name("photos")]
+    | Annotated[MakeSpectra, name("spectra")]
+    | Annotated[Fit, name("fit")]
+    | Annotated[FitGeometry, name("fit-geometry")]
+    | Annotated[FitRadio, name("fit-radio")]
+    | Annotated[Render, name("render")]
+    | Annotated[Csi, name("csi")]
+    | Annotated[Eval, name("eval")]
+    | Annotated[View, name("view")]
+    | Annotated[Info, name("info")]
+    | Annotated[Validate, name("validate")]
+    | Annotated[Doctor, name("doctor")]
+)
+
+ABOUT = """rf3dgs: radio radiance fields. From photographs of a site and a few tens of radio spectra to a model that
+answers, at any receiver pose, which paths arrive from where, how strong, how late, and how they left the transmitter.
+`rf3dgs demo` shows the whole story on the built-in lobby."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit status: 0 good, 1 found faults, 2 an error, 130 interrupted."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if list(arguments) in (["--version"], ["version"]):
+        print(f"rf3dgs {__version__}")  # noqa: T201
+        return 0
+    logging.basicConfig(level=os.environ.get("RF3DGS_LOG", "WARNING").upper(), format="%(name)s: %(message)s")
+    command = tyro.cli(
+        Command,  # type: ignore[arg-type]
+        prog="rf3dgs",
+        description=ABOUT,
+        args=list(arguments),
+        config=(tyro.conf.OmitArgPrefixes, tyro.conf.ConsolidateSubcommandArgs)[1:],
+    )
+    try:
+        return command.run()
+    except RfError as error:
+        print(f"rf3dgs: {error}", file=sys.stderr)  # noqa: T201
+        return 2
+    except KeyboardInterrupt:
+        print("rf3dgs: interrupted; a started training run resumes from its last checkpoint", file=sys.stderr)  # noqa: T201
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0

@@ -1,0 +1,138 @@
+"""`trace`, `photos` and `spectra`: from a scene to a dataset folder."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from rf3dgs.cli.show import console, out
+from rf3dgs.core.errors import InputError
+from rf3dgs.propagation.config import PhotoConfig, TraceConfig
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Trace the paths from the transmitter to many receivers with Sionna RT."""
+
+    scene: tyro.conf.Positional[str]
+    """"lobby", a scene that ships with Sionna RT ("box", "simple_street_canyon"), or a Sionna/Mitsuba XML file."""
+    rx_count: int = 72
+    """Receivers, drawn in the free space of the scene."""
+    rx_seed: int = 0
+    """Decides where the receivers stand."""
+    out: Path = Path("lobby.paths")
+    """The HDF5 file to write; a killed run leaves none."""
+    trace: TraceConfig = field(default_factory=TraceConfig)
+    """How paths are traced."""
+
+    def run(self) -> int:
+        """Trace one receiver after the other; memory stays flat."""
+        import math
+
+        from rf3dgs.channel.binning import bin_diffuse
+        from rf3dgs.channel.io import PathsWriter
+        from rf3dgs.cli.facts import open_scene
+        from rf3dgs.propagation.sionna import trace_each
+
+        scene = open_scene(self.scene)
+        rx = scene.receivers(self.rx_count, self.rx_seed)
+        frequency = self.trace.frequency or scene.frequency
+        meta = {"scene": scene.name, "rays": self.trace.rays, "seed": self.trace.seed, "rx_seed": self.rx_seed}
+        cell = math.radians(self.trace.cell_deg)
+        with PathsWriter(self.out, frequency, scene.tx, meta) as writer:
+            for paths in trace_each(scene, scene.tx, rx, self.trace, console()):
+                writer.append(bin_diffuse(paths, cell=cell, delay_step=self.trace.delay_step))
+        out(f"{self.out}: {self.rx_count} receivers, {self.out.stat().st_size / 1e6:.1f} MB")
+        return 0
+
+
+@dataclass(frozen=True)
+class MakePhotos:
+    """Render posed photographs of a scene with Mitsuba, in nerfstudio's layout."""
+
+    scene: tyro.conf.Positional[str]
+    """"lobby", a scene that ships with Sionna RT, or a Sionna/Mitsuba XML file."""
+    count: int = 60
+    """Photographs."""
+    tour_seed: int = 0
+    """Decides where the cameras stand."""
+    out: Path = Path("lobby/photos")
+    """The folder to write: pictures and transforms.json."""
+    photo: PhotoConfig = field(default_factory=PhotoConfig)
+    """How photographs are rendered."""
+
+    def run(self) -> int:
+        """Render and write all of them, or nothing."""
+        from rf3dgs.cli.chain import photograph
+        from rf3dgs.cli.facts import open_scene
+        from rf3dgs.core.files import atomic_folder
+        from rf3dgs.data.formats.nerfstudio import write_nerfstudio
+
+        scene = open_scene(self.scene)
+        with atomic_folder(self.out) as folder:
+            photos = photograph(scene, self.count, self.tour_seed, self.photo, folder, console())
+            write_nerfstudio(photos, folder)
+        out(f"{self.out}: {self.count} photographs of {self.photo.width}x{self.photo.height}")
+        return 0
+
+
+@dataclass(frozen=True)
+class MakeSpectra:
+    """Make spectra of traced paths and put them, with the photographs beside, into a dataset folder."""
+
+    paths: tyro.conf.Positional[Path]
+    """A file written by rf3dgs trace."""
+    out: Path = Path("lobby")
+    """The dataset folder; photographs already in its photos/ folder are kept."""
+    method: Literal["ideal", "bartlett", "tapered", "capon", "cbf", "tcbf", "mvdr"] = "ideal"
+    """Ideal narrow lobe, or an array's Bartlett (CBF), Hann-tapered (TCBF) or Capon (MVDR) spectrum."""
+    array: str = "8x8"
+    """Rows x columns of the receiving array, at half a wavelength; ideal spectra need none."""
+    pattern: Literal["isotropic", "dipole", "patch", "tr38901"] = "patch"
+    """The array's element."""
+    grid: Literal["sphere", "pinhole"] = "sphere"
+    """The whole sphere, or a pinhole picture that looks along the receiver's forward axis."""
+    size: tuple[int, int] | None = None
+    """Width and height [pixel]: 180 90 for a sphere, 300 200 for a pinhole unless given."""
+    fov_deg: float = 90.0
+    """Horizontal field of view of a pinhole [deg]."""
+    snr_db: float | None = None
+    """Signal-to-noise ratio at the elements [dB]; no noise unless given. Array methods only."""
+    seed: int = 0
+    """Of the noise and of the split."""
+
+    def run(self) -> int:
+        """Read, synthesise, split and write."""
+        from rf3dgs.channel.arrays import planar_array
+        from rf3dgs.channel.io import PathsReader
+        from rf3dgs.core.grids import equirect_grid, pinhole_grid
+        from rf3dgs.core.progress import track
+        from rf3dgs.data.dataset import Dataset
+        from rf3dgs.data.formats.detect import read_photos
+        from rf3dgs.spectra.spectrum import stack_spectra
+        from rf3dgs.spectra.synthesis import spectrum_of
+
+        rows, cols = _size_of(self.array)
+        array = None if self.method == "ideal" else planar_array(rows, cols, pattern=self.pattern)
+        if self.grid == "sphere":
+            grid = equirect_grid(*(self.size or (180, 90)))
+        else:
+            grid = pinhole_grid(*(self.size or (300, 200)), fov_deg=self.fov_deg)
+        with PathsReader(self.paths) as reader:
+            spectra = [
+                spectrum_of(paths, array, grid, method=self.method, snr_db=self.snr_db, seed=self.seed + index)
+                for index, paths in enumerate(track(reader, "spectra", len(reader), console()))
+            ]
+        photos = read_photos(self.out / "photos").photos if (self.out / "photos").is_dir() else ()
+        meta = {"generator": f"rf3dgs spectra, method {self.method}", "seed": self.seed}
+        Dataset(photos, stack_spectra(spectra), meta=meta).split(seed=self.seed).save(self.out)
+        out(f"{self.out}: {len(spectra)} spectra of {grid.width}x{grid.height}, {len(photos)} photographs")
+        return 0
+
+
+def _size_of(array: str) -> tuple[int, int]:
+    rows, _, cols = array.partition("x")
+    if not (rows.isdigit() and cols.isdigit() and int(rows) and int(cols)):
+        raise InputError(f'--array must be rows x columns such as "8x8"; got {array!r}')
+    return int(rows), int(cols)
