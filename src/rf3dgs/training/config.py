@@ -102,7 +102,7 @@ class VisualConfig:
     prune_opacity: float = 0.005
     """Fainter Gaussians are removed."""
     prune_size: float = 0.1
-    """Gaussians larger than this share of the scene's extent are removed."""
+    """Gaussians larger than this share of the scene's extent are removed in the second half of growth."""
     prune_unseen: float = 1.0
     """Gaussians whose blending weights over all photographs sum to less than this many pixels are removed, three times
     during growth and at the end."""

@@ -159,6 +159,7 @@ class VisualStage:
         """Grow, prune and reset opacity where the schedule says so."""
         config, schedule = self.config, self.schedule
         if schedule.densifies_after(iteration):
+            limits_size = 2 * iteration >= schedule.densify_from + schedule.densify_until
             change = densify(
                 self.gaussians(),
                 self.density,
@@ -168,7 +169,7 @@ class VisualStage:
                 dense_fraction=config.split_size,
                 max_count=config.max_count,
                 opacity_floor=config.prune_opacity,
-                largest_scale=config.prune_size * self.extent,
+                largest_scale=config.prune_size * self.extent if limits_size else None,
             )
             self._follow(change)
         if schedule.prunes_unseen_after(iteration) and config.prune_unseen > 0:

@@ -1,0 +1,188 @@
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from rf3dgs.core.errors import InputError
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import Camera, pinhole_grid
+from rf3dgs.data.photo import Photo
+from rf3dgs.splats.density import Change
+from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.splats.image_loss import psnr
+from rf3dgs.training.adam import Adam
+from rf3dgs.training.config import VisualConfig
+from rf3dgs.training.initial import camera_box, random_start, views_of
+from rf3dgs.training.photographs import blending_weights, render_photo
+from rf3dgs.training.schedule import Schedule
+from rf3dgs.training.visual import VisualStage, fit_geometry
+
+SMALL = VisualConfig(
+    steps=160, start_count=80, max_count=160, bounds=((-1, -1, -1), (1, 1, 1)), background="black", degree=1
+)
+
+
+def ring(count: int) -> list[Camera]:
+    grid = pinhole_grid(32, 24, 60)
+    turns = [2 * math.pi * index / count for index in range(count)]
+    poses = [Pose.look_at((3 * math.cos(turn), 3 * math.sin(turn), 0.5), (0.0, 0.0, 0.0)) for turn in turns]
+    return [Camera.of(pose, grid) for pose in poses]
+
+
+def blobs(count: int = 30, seed: int = 3) -> Gaussians:
+    random = Gaussians.random(count, (-1, -1, -1), (1, 1, 1), degree=0, seed=seed)
+    return dataclasses.replace(random, logit_opacities=random.logit_opacities + 4)
+
+
+@pytest.fixture(scope="module")
+def photos() -> list[Photo]:
+    return [Photo(f"p{index}", camera, pixels=render_photo(blobs(), camera)) for index, camera in enumerate(ring(6))]
+
+
+def test_an_overfitted_view_is_reproduced(photos):
+    config = dataclasses.replace(SMALL, steps=250, lr_sh=2e-2, lr_means=5e-3, lr_scales=2e-2, prune_size=1.0)
+    fitted = fit_geometry(photos[:1], config, initial=blobs(120, seed=9))
+    assert psnr(render_photo(fitted, photos[0].camera), photos[0].load()) > 30
+
+
+def test_fitting_photographs_explains_a_view_that_was_held_out(photos):
+    config = dataclasses.replace(SMALL, steps=300)
+    before = VisualStage(photos[1:], config).gaussians()
+    fitted = fit_geometry(photos[1:], config)
+    held_out = photos[0]
+    gain = [float(psnr(render_photo(gaussians, held_out.camera), held_out.load())) for gaussians in (before, fitted)]
+    assert gain[1] > gain[0] + 4
+
+
+def test_the_same_seed_gives_the_same_gaussians(photos):
+    first, second = (fit_geometry(photos, dataclasses.replace(SMALL, steps=40)) for _ in range(2))
+    other = fit_geometry(photos, dataclasses.replace(SMALL, steps=40, seed=1))
+    assert all(torch.equal(value, second.tensors()[name]) for name, value in first.tensors().items())
+    assert not torch.equal(first.means[:20], other.means[:20])
+
+
+def test_growth_happens_where_the_gradient_is(photos):
+    half_known = blobs()
+    lost = dataclasses.replace(half_known, sh=half_known.sh.clone())
+    lost.sh[half_known.means[:, 0] > 0] *= -1
+    config = dataclasses.replace(
+        SMALL, steps=40, densify_from=12, densify_every=12, densify_until=12, double_at=(0, 0), prune_unseen=0.0
+    )
+    stage = VisualStage(photos, config, lost)
+    for iteration in range(11):
+        stage.step(iteration)
+    gradient = stage.density.mean_gradient
+    stage.config = dataclasses.replace(config, grow_gradient=float(gradient.median()))
+    quiet, means = gradient < gradient.median(), stage.gaussians().means
+    stage.step(11)
+    grown = stage.gaussians()
+    added = len(grown) - len(means)
+    assert abs(added - int((~quiet).sum())) <= 2
+    parents = torch.cdist(grown.means[-added:], means).argmin(-1)
+    assert float((~quiet)[parents].float().mean()) > 0.7
+
+
+def test_growth_stops_at_the_largest_count(photos):
+    config = dataclasses.replace(SMALL, steps=120, max_count=90, grow_gradient=0.0)
+    assert len(fit_geometry(photos, config)) <= 90
+
+
+def test_gaussians_that_no_photograph_shows_are_removed(photos):
+    hidden = Gaussians.random(7, (0, 0, 40), (1, 1, 41), degree=0, seed=1)
+    stage = VisualStage(photos, dataclasses.replace(SMALL, steps=1), Gaussians.join([blobs(), hidden]))
+    stage.step(0)
+    assert float(stage.gaussians().means[:, 2].max()) < 10
+    assert len(stage.gaussians()) <= 30
+
+
+def test_blending_weights_add_up_to_the_pictures_coverage(photos):
+    from rf3dgs.splats.rasterize import rasterize
+
+    scene, cameras = blobs(), ring(3)
+    args = scene.means, scene.quats, scene.scales, scene.opacities, torch.ones(len(scene), 1)
+    coverage = sum(float(rasterize(*args, camera).weight.sum()) for camera in cameras)
+    assert float(blending_weights(scene, cameras).sum()) == pytest.approx(coverage, rel=1e-4)
+
+
+def test_harmonics_rise_one_degree_at_a_time_and_start_at_zero(photos):
+    stage = VisualStage(photos, dataclasses.replace(SMALL, steps=60, degree=2, degree_every=5, densify_until=0))
+    widths = []
+    for iteration in range(12):
+        stage.step(iteration)
+        widths.append(stage.parameters["bands"].shape[1])
+    assert widths == [0] * 5 + [3] * 5 + [8] * 2
+    assert stage.gaussians().degree == 2
+
+
+def test_pictures_begin_at_a_quarter_of_their_resolution():
+    schedule = Schedule.of(VisualConfig())
+    assert [schedule.shrink_at(iteration) for iteration in (0, 249, 250, 499, 500)] == [4, 4, 2, 2, 1]
+    assert schedule.densify_from == 500
+    assert (schedule.densify_every, schedule.densify_until, schedule.reset_every) == (100, 15_000, 3_000)
+    assert [schedule.degree_at(iteration) for iteration in (999, 1000, 3000, 29_999)] == [0, 1, 3, 3]
+    assert schedule.means_rate(0) == pytest.approx(1.6e-4)
+    assert schedule.means_rate(29_999) == pytest.approx(1.6e-6)
+
+
+def test_a_short_run_keeps_the_proportions():
+    schedule = Schedule.of(VisualConfig(steps=1_000))
+    assert schedule.double_at == (50, 100)
+    assert (schedule.densify_from, schedule.densify_every, schedule.densify_until) == (100, 20, 500)
+    assert not any(schedule.resets_after(iteration) for iteration in range(1_000))
+
+
+def test_random_gaussians_are_where_two_cameras_look():
+    cameras = ring(6)
+    low, high = camera_box(cameras)
+    start = random_start(cameras, 500, low, high, degree=0, seed=0)
+    assert 400 <= len(start) <= 500
+    assert int(views_of(start.means, cameras).min()) >= 2
+    assert low[0] < -3 < 3 < high[0]
+
+
+def test_points_are_a_place_to_begin(photos):
+    points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    stage = VisualStage(photos, SMALL, points)
+    assert torch.equal(stage.gaussians().means, points)
+
+
+def test_adam_agrees_with_torch_and_follows_rows():
+    generator = torch.Generator().manual_seed(0)
+    start = torch.randn(6, 3, generator=generator)
+    ours = Adam({"values": start.clone().requires_grad_()})
+    theirs = torch.nn.Parameter(start.clone())
+    optimiser = torch.optim.Adam([theirs], lr=0.01, eps=1e-15)
+    for _ in range(5):
+        gradient = torch.randn(6, 3, generator=generator)
+        ours.parameters["values"].grad, theirs.grad = gradient.clone(), gradient.clone()
+        ours.step({"values": 0.01})
+        optimiser.step()
+    assert torch.allclose(ours.parameters["values"], theirs, atol=1e-6)
+    source, fresh = torch.tensor([5, 0, 0]), torch.tensor([False, False, True])
+    before = ours.first["values"].clone()
+    ours.follow(Change(blobs(3), source, fresh), {"values": start[source].requires_grad_()})
+    assert torch.equal(ours.first["values"], torch.stack((before[5], before[0], torch.zeros(3))))
+
+
+def test_no_photographs_are_refused():
+    with pytest.raises(InputError, match="needs at least one photograph; got none"):
+        fit_geometry([], SMALL)
+
+
+def test_a_photograph_that_does_not_fit_its_camera_is_refused_by_name(photos):
+    wrong = Photo("hall 7", photos[0].camera, pixels=torch.zeros(10, 32, 3))
+    with pytest.raises(InputError, match=r"photo hall 7.*24, 32, 3.*got \[10, 32, 3\]"):
+        fit_geometry([photos[1], wrong], SMALL)
+
+
+def test_a_photograph_with_nan_is_refused_by_name(photos):
+    pixels = photos[0].load().clone()
+    pixels[3, 4, 1] = float("nan")
+    with pytest.raises(InputError, match="photo dark 1 or its camera has NaN"):
+        fit_geometry([Photo("dark 1", photos[0].camera, pixels=pixels)], SMALL)
+
+
+def test_counts_that_make_no_sense_are_refused(photos):
+    with pytest.raises(InputError, match="steps, start_count and max_count must be at least 1; got 0"):
+        fit_geometry(photos, dataclasses.replace(SMALL, steps=0))
