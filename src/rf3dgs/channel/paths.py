@@ -1,6 +1,7 @@
 """`Paths`: the propagation paths between one transmitter and any number of receivers."""
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
@@ -8,6 +9,9 @@ from torch import Tensor
 from rf3dgs.core.angles import direction_of
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
+
+if TYPE_CHECKING:
+    from rf3dgs.channel.arrays import PlanarArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +76,33 @@ class Paths:
     def count(self) -> Tensor:
         """Number of valid paths `[*batch]`."""
         return self.valid.sum(-1)
+
+    def cfr(
+        self,
+        array_rx: "PlanarArray | None" = None,
+        array_tx: "PlanarArray | None" = None,
+        subcarriers: Tensor | None = None,
+        *,
+        phase: Literal["carrier", "zero", "random"] = "carrier",
+        seed: int = 0,
+    ) -> Tensor:
+        """Channel frequency response `[*batch, rx_ant, tx_ant, subcarrier]`; see `channel.response.cfr`."""
+        from rf3dgs.channel.response import cfr
+
+        return cfr(self, array_rx, array_tx, subcarriers, phase=phase, seed=seed)
+
+    def cir(
+        self,
+        array_rx: "PlanarArray | None" = None,
+        array_tx: "PlanarArray | None" = None,
+        *,
+        phase: Literal["carrier", "zero", "random"] = "carrier",
+        seed: int = 0,
+    ) -> tuple[Tensor, Tensor]:
+        """Amplitudes `[*batch, rx_ant, tx_ant, path]` and delays `[*batch, path]` [s]; see `channel.response.cir`."""
+        from rf3dgs.channel.response import cir
+
+        return cir(self, array_rx, array_tx, phase=phase, seed=seed)
 
     def __getitem__(self, index: int | slice | Tensor) -> "Paths":
         """The paths of some receivers."""

@@ -1,0 +1,46 @@
+"""Spectra: power per direction, how instruments see it, and how it is encoded, resampled and searched."""
+
+from typing import TYPE_CHECKING
+
+from rf3dgs.core.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from rf3dgs.spectra.beamformers import bartlett as bartlett
+    from rf3dgs.spectra.beamformers import capon as capon
+    from rf3dgs.spectra.beamformers import hann_taper as hann_taper
+    from rf3dgs.spectra.beamformers import tapered as tapered
+    from rf3dgs.spectra.codec import DbWindow as DbWindow
+    from rf3dgs.spectra.codec import PaperEncoding as PaperEncoding
+    from rf3dgs.spectra.codec import window_of as window_of
+    from rf3dgs.spectra.covariance import covariance_of as covariance_of
+    from rf3dgs.spectra.covariance import covariance_of_spectrum as covariance_of_spectrum
+    from rf3dgs.spectra.peaks import find_peaks as find_peaks
+    from rf3dgs.spectra.peaks import main_peak as main_peak
+    from rf3dgs.spectra.resampling import resample as resample
+    from rf3dgs.spectra.scan import array_instrument as array_instrument
+    from rf3dgs.spectra.scan import spectrum_of as spectrum_of
+    from rf3dgs.spectra.spectrum import Instrument as Instrument
+    from rf3dgs.spectra.spectrum import Spectrum as Spectrum
+    from rf3dgs.spectra.synthesis import default_lobe as default_lobe
+
+_HOMES = {
+    "Spectrum": ".spectrum",
+    "Instrument": ".spectrum",
+    "spectrum_of": ".scan",
+    "default_lobe": ".synthesis",
+    "array_instrument": ".scan",
+    "covariance_of": ".covariance",
+    "covariance_of_spectrum": ".covariance",
+    "bartlett": ".beamformers",
+    "tapered": ".beamformers",
+    "capon": ".beamformers",
+    "hann_taper": ".beamformers",
+    "DbWindow": ".codec",
+    "window_of": ".codec",
+    "PaperEncoding": ".codec",
+    "find_peaks": ".peaks",
+    "main_peak": ".peaks",
+    "resample": ".resampling",
+}
+__all__ = list(_HOMES)
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

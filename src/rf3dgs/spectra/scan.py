@@ -1,0 +1,113 @@
+"""`spectrum_of`: from paths to what an instrument sees."""
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from rf3dgs.channel.arrays import PlanarArray
+from rf3dgs.channel.paths import Paths
+from rf3dgs.channel.response import manifold
+from rf3dgs.core.errors import InputError
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import DirectionGrid, equirect_grid
+from rf3dgs.core.progress import Progress, Silent
+from rf3dgs.spectra.beamformers import bartlett, capon, hann_taper, tapered
+from rf3dgs.spectra.covariance import covariance_of
+from rf3dgs.spectra.spectrum import Instrument, Spectrum
+from rf3dgs.spectra.synthesis import ideal_spectrum, pose_for
+
+Method = Literal["ideal", "bartlett", "tapered", "capon", "cbf", "tcbf", "mvdr"]
+ALIASES = {"cbf": "bartlett", "tcbf": "tapered", "mvdr": "capon"}
+METHODS = ("ideal", "bartlett", "tapered", "capon")
+
+
+def spectrum_of(
+    paths: Paths,
+    array: PlanarArray | None = None,
+    grid: DirectionGrid | None = None,
+    *,
+    method: Method = "ideal",
+    lobe: float | None = None,
+    snr_db: float | None = None,
+    snapshots: int | None = 256,
+    bandwidth: float = 2e9,
+    loading: float = 1e-3,
+    pose: Pose | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Spectrum:
+    """The spectrum of paths `[*batch, path]` on `grid`: power [linear] per direction, `[*batch, row, col]`.
+
+    "ideal": power summed through a Gaussian lobe of half-power width `lobe` [rad]; with delay and AoD, without array.
+    "bartlett" (CBF), "tapered" (TCBF, Hann) and "capon" (MVDR, with diagonal `loading`): through `array`, from
+    `snapshots` coherent frequencies over `bandwidth` [Hz] (None: uncorrelated paths), with white noise at `snr_db`
+    (none by default) drawn from `seed`. Levels of arrays are relative to the element's peak gain, so that a path of
+    gain g at boresight gives g. `pose` (default: the receivers') turns the grid and the array.
+    """
+    if grid is None:
+        raise InputError("spectrum_of needs a grid; use pinhole_grid, equirect_grid or list_grid")
+    name = ALIASES.get(method, method)
+    if name not in METHODS:
+        raise InputError(f"method must be one of {', '.join((*METHODS, *ALIASES))}; got {method!r}")
+    if name == "ideal":
+        if snr_db is not None:
+            raise InputError('an ideal spectrum has no elements to add noise to; use snr_db with method="bartlett"')
+        return ideal_spectrum(paths, grid, lobe=lobe, pose=pose, progress=progress)
+    if array is None:
+        raise InputError(f'method {name!r} needs an array, such as planar_array(8, 8); only "ideal" does without')
+    if lobe is not None:
+        raise InputError(f'lobe belongs to method "ideal"; the lobe of {name!r} is that of its array')
+    pose = pose_for(paths, pose)
+    batch, length = paths.coeff.shape[:-1], paths.coeff.shape[-1]
+    rx = Pose(pose.position.reshape(-1, 3), pose.orientation.reshape(-1, 4))
+    rows = paths._map(lambda value: value.reshape(-1, length), rx=rx)
+    steering = manifold(array, grid.directions.double())
+    power = torch.empty(len(rx), *grid.shape)
+    reporter = Silent() if progress is None else progress
+    reporter.start(f"{name} spectra", len(rx))
+    for index in range(len(rx)):
+        R = covariance_of(
+            rows[index], array, snapshots=snapshots, bandwidth=bandwidth, snr_db=snr_db, seed=seed + index
+        )
+        power[index] = (beamform(name, R, steering, array, loading=loading) / array.peak_gain).float()
+        reporter.update(index + 1)
+    reporter.finish()
+    return Spectrum(
+        power=power.reshape(*batch, *grid.shape),
+        grid=grid,
+        pose=pose,
+        frequency=paths.frequency,
+        instrument=array_instrument(array, name),
+        method=name,
+        tx=paths.tx,
+    )
+
+
+def beamform(method: str, R: Tensor, A: Tensor, array: PlanarArray, *, loading: float = 1e-3) -> Tensor:
+    """Power `[*batch, *direction]` by the method's name; see `beamformers`."""
+    if method == "bartlett":
+        return bartlett(R, A)
+    if method == "tapered":
+        return tapered(R, A, hann_taper(array))
+    return capon(R, A, loading)
+
+
+def array_instrument(array: PlanarArray, method: str) -> Instrument:
+    """The instrument of an array: half-power width in azimuth and solid angle of its beam at boresight.
+
+    Capon adapts its beam to the signals; it is given the Bartlett beam's figures.
+    """
+    boresight = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    centre = manifold(array, boresight)
+    R = centre[:, None] * centre.conj() / array.peak_gain
+    fixed = "tapered" if method == "tapered" else "bartlett"
+    sphere = equirect_grid(180, 90)
+    beam = beamform(fixed, R, manifold(array, sphere.directions.double()), array)
+    angle = torch.linspace(0.0, math.pi / 2, 2001, dtype=torch.float64)
+    cut = torch.stack((torch.cos(angle), torch.sin(angle), torch.zeros_like(angle)), -1)
+    steering = manifold(PlanarArray(array.rows, array.cols, "isotropic", array.vertical, array.horizontal), cut)
+    below = torch.nonzero(beamform(fixed, R, steering, array) < 0.5)
+    half = float(angle[below[0, 0]]) if len(below) else math.pi / 2
+    return Instrument(f"{array.label} {method}", 2 * half, float((beam * sphere.solid_angle).sum()))
