@@ -25,7 +25,7 @@ GRID = equirect_grid(180, 90)
 
 
 def view(field: RadioField, *, port: int = 8080, wait: bool = True) -> "Viewer":
-    """Serve `field` on http://127.0.0.1:`port`; with `wait` until interrupted. Raises InputError if the port is taken."""
+    """Serve `field` on http://127.0.0.1:`port`, with `wait` until interrupted; InputError if the port is taken."""
     viewer = Viewer(field, port=port)
     if wait:
         viewer.wait()
@@ -104,8 +104,9 @@ class Viewer:
         self._server.initial_camera.look_at = tuple(centre)
         gui.configure_theme(control_width="large", show_logo=False)
         gui.add_markdown(
-            "**Drag the blue receiver.** The picture is the whole sphere around it: the left edge is azimuth 180°, the "
-            f"middle 0°, the top is up. Colours run from {field.window.floor_db:.0f} dB to {field.window.ceil_db:.0f} dB."
+            "**Drag the blue receiver.** The picture is the whole sphere around it: the left edge is azimuth 180°, "
+            f"the middle 0°, the top is up. Dark is {field.window.floor_db:.0f} dB, "
+            f"yellow {field.window.ceil_db:.0f} dB."
         )
         blank = np.zeros((GRID.height, GRID.width, 3), dtype=np.uint8)
         self._picture = gui.add_image(blank, label="spectrum", format="png")
@@ -178,7 +179,7 @@ def table(paths: Paths) -> str:
         lines.append(
             f"| {float(gain_db[index]):.1f} dB | {1e9 * float(paths.delay[index]):.1f} ns | {' | '.join(ends)} |"
         )
-    return "\n".join(lines + ["", "Angles are azimuth, zenith."])
+    return "\n".join([*lines, "", "Angles are azimuth, zenith."])
 
 
 def _check_port(port: int) -> None:
