@@ -1,0 +1,47 @@
+"""What can be chosen about tracing and photographing; free of heavy imports, so that `--help` is instant."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class TraceConfig:
+    """How paths are traced."""
+
+    depth: int = 3
+    """Largest number of interactions (reflections, diffuse or specular) of a path."""
+    rays: int = 300_000
+    """Rays shot from the transmitter; below 300,000 the rays' lattice shows as dots near the receiver."""
+    seed: int = 0
+    """Receiver number i is traced with the seed `seed + i`."""
+    frequency: float | None = None
+    """Carrier [Hz]; the scene's own when absent."""
+    line_of_sight: bool = True
+    """Whether the direct path is traced."""
+    specular: bool = True
+    """Whether mirror-like reflections are traced."""
+    diffuse: bool = True
+    """Whether diffuse reflections are traced."""
+    cell_deg: float = 1.0
+    """`trace` merges diffuse paths that arrive within one cell of this size [deg] ..."""
+    delay_step: float = 1e-9
+    """... and within this delay [s]; line of sight and purely specular paths are kept exactly."""
+
+
+@dataclass(frozen=True)
+class PhotoConfig:
+    """How photographs are rendered."""
+
+    width: int = 320
+    """Pixels in a row."""
+    height: int = 240
+    """Rows."""
+    fov_deg: float = 85.0
+    """Horizontal field of view [deg]."""
+    samples: int = 64
+    """Light paths per pixel; noise falls with the square root."""
+    bounces: int = 6
+    """Largest number of segments of a light path."""
+    exposure: float = 1.0
+    """Factor on the linear light before the sRGB curve, on top of the scene's own exposure."""
+    seed: int = 0
+    """Photograph number i is rendered with the seed `seed + i`."""

@@ -1,0 +1,214 @@
+"""Paths traced by NVIDIA's Sionna RT on the CPU: line of sight, mirrors and diffuse reflections.
+
+One receiver is traced at a time, which keeps memory flat. Rays do not pass through walls and do not bend round edges.
+A path's gain is the mean over two transmit polarisations (vertical, horizontal) of the power summed over both receive
+polarisations; its phase is that of vertical to vertical.
+"""
+
+import math
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rf3dgs.channel.binning import bin_diffuse, stack_paths
+from rf3dgs.channel.paths import Paths
+from rf3dgs.core.errors import InputError, MissingDependencyError, RfError
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.progress import Progress, Silent
+from rf3dgs.propagation.config import TraceConfig
+from rf3dgs.propagation.llvm import mitsuba_variant, prepare
+from rf3dgs.propagation.scene import Scene
+from rf3dgs.propagation.scene_files import write_radio_scene
+
+VARIANT = "llvm_ad_mono_polarized"
+
+
+def trace(
+    scene: Scene | str | Path,
+    *,
+    rx: Pose,
+    tx: Pose | None = None,
+    config: TraceConfig | None = None,
+    frequency: float | None = None,
+    progress: Progress | None = None,
+) -> Paths:
+    """The paths `[rx, path]` to each of the poses `rx`, diffuse ones merged by arrival cell and delay (bin_diffuse).
+
+    scene: a `Scene`, the name of a built-in one ("lobby", "box", "simple_street_canyon", ...) or a Sionna/Mitsuba XML
+    file. tx: the scene's own transmitter when absent. frequency [Hz] overrides the configuration's and the scene's.
+    Raises as `trace_each` does.
+    """
+    config = TraceConfig() if config is None else config
+    cell = math.radians(config.cell_deg)
+    rows = trace_each(scene, tx, rx, config, progress, frequency=frequency)
+    return stack_paths([bin_diffuse(row, cell=cell, delay_step=config.delay_step)[0] for row in rows])
+
+
+def trace_each(
+    scene: Scene | str | Path,
+    tx: Pose | None,
+    rx: Pose,
+    config: TraceConfig | None = None,
+    progress: Progress | None = None,
+    *,
+    frequency: float | None = None,
+    indices: Sequence[int] | None = None,
+) -> Iterator[Paths]:
+    """Yield all paths `[1, path]` to one receiver after the other, sorted by delay, then by angles.
+
+    Receiver i uses the seed `config.seed + i`, or `config.seed + indices[i]` when `rx` is part of a longer list, so
+    that a run may be cut in pieces. The same arguments give the same bits. A receiver that nothing reaches has zero paths.
+    Raises InputError for a receiver outside the scene, inside an object or at the transmitter, and for materials that
+    are not defined at the frequency; MissingDependencyError without sionna-rt or LLVM.
+    """
+    from rf3dgs.propagation.scenes import scene_of
+
+    config = TraceConfig() if config is None else config
+    progress = Silent() if progress is None else progress
+    scene = scene if isinstance(scene, Scene) else scene_of(scene)
+    tx = scene.tx if tx is None else tx
+    frequency = frequency or config.frequency or scene.frequency
+    numbers = range(len(rx)) if indices is None else indices
+    _check(scene, tx, rx, config, frequency)
+    return _trace_each(scene, tx, rx, config, progress, frequency, list(numbers))
+
+
+def _trace_each(
+    scene: Scene, tx: Pose, rx: Pose, config: TraceConfig, progress: Progress, frequency: float, numbers: list[int]
+) -> Iterator[Paths]:
+    tracer = Tracer(scene, frequency)
+    progress.start("tracing", len(rx))
+    for done, number in enumerate(numbers):
+        yield tracer.paths(tx, rx[done : done + 1], config, config.seed + number)
+        progress.update(done + 1)
+    progress.finish()
+
+
+def import_sionna():
+    """The package `sionna.rt`, with LLVM found first; raises MissingDependencyError when either is missing."""
+    prepare()
+    try:
+        import mitsuba
+
+        if mitsuba.variant() is None:
+            mitsuba.set_variant(VARIANT)
+        with mitsuba_variant(VARIANT):
+            import sionna.rt
+    except ImportError as error:
+        raise MissingDependencyError(f"tracing needs sionna-rt ({error}): pip install 'rf3dgs[trace]'") from error
+    return sionna.rt
+
+
+class Tracer:
+    """A scene loaded into Sionna RT, ready for one receiver after the other."""
+
+    def __init__(self, scene: Scene, frequency: float) -> None:
+        self._rt = rt = import_sionna()
+        self._frequency = frequency
+        with mitsuba_variant(VARIANT), ExitStack() as stack:
+            if scene.source is not None:
+                self._scene = rt.load_scene(str(scene.source), merge_shapes=False)
+                for item in scene.objects:
+                    self._scene.objects[item.name].radio_material.scattering_coefficient = item.scattering
+            else:
+                folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="rf3dgs-"))
+                path = write_radio_scene(scene, folder, frequency=frequency)
+                self._scene = rt.load_scene(str(path), merge_shapes=False)
+            self._scene.frequency = frequency
+            array = rt.PlanarArray(
+                num_rows=1, num_cols=1, vertical_spacing=0.5, horizontal_spacing=0.5, pattern="iso", polarization="VH"
+            )
+            self._scene.tx_array = self._scene.rx_array = array
+            self._solver = rt.PathSolver(deterministic=True)
+
+    def paths(self, tx: Pose, rx: Pose, config: TraceConfig, seed: int) -> Paths:
+        """All paths `[1, path]` to the one receiver `rx` `[1]`, sorted by delay, then by angles."""
+        scene, rt = self._scene, self._rt
+        # A ray leaves at most one candidate per bounce, and the line of sight is one more: this room is never filled.
+        room = config.rays * max(config.depth, 1) + 10_000
+        with mitsuba_variant(VARIANT):
+            for name in [*scene.transmitters, *scene.receivers]:
+                scene.remove(name)
+            scene.add(rt.Transmitter("tx", position=tx.position.tolist()))
+            scene.add(rt.Receiver("rx", position=rx.position[0].tolist()))
+            found = self._solver(
+                scene,
+                max_depth=config.depth,
+                samples_per_src=config.rays,
+                max_num_paths_per_src=room,
+                synthetic_array=True,
+                los=config.line_of_sight,
+                specular_reflection=config.specular,
+                diffuse_reflection=config.diffuse,
+                refraction=False,
+                diffraction=False,
+                seed=seed,
+            )
+            real, imaginary = (np.array(part)[0, :, 0] for part in found.a)
+            valid = np.array(found.valid)[0, 0]
+            angles = [np.array(part)[0, 0] for part in (found.theta_r, found.phi_r, found.theta_t, found.phi_t)]
+            delay = np.array(found.tau)[0, 0]
+            kinds = np.array(found.interactions).reshape(-1, 1, 1, len(valid))[:, 0, 0]
+        if len(valid) >= room:
+            raise RfError(f"the tracer's room for {room} paths is full, so paths may be missing; raise rays or lower depth")
+        return _paths(real + 1j * imaginary, delay, angles, kinds, valid, self._frequency, tx, rx)
+
+
+def _paths(
+    a: NDArray, delay: NDArray, angles: list[NDArray], kinds: NDArray, valid: NDArray, frequency: float, tx: Pose, rx: Pose
+) -> Paths:
+    """Sionna's arrays as `Paths` `[1, path]`: `a` [rx polarisation, tx polarisation, path], `kinds` [depth, path]."""
+    a, delay, kinds, angles = a[..., valid], delay[valid], kinds[:, valid], [angle[valid] for angle in angles]
+    power = 0.5 * (np.abs(a) ** 2).sum((0, 1))
+    coeff = np.sqrt(power) * np.exp(1j * np.angle(a[0, 0]))
+    order = (kinds > 0).sum(0)
+    kind = np.bitwise_or.reduce(kinds, axis=0) if len(kinds) else np.zeros_like(order)
+    rank = np.lexsort((power, kind, *angles[::-1], delay))
+
+    def column(value: NDArray, dtype: torch.dtype) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(value[rank])).to(dtype)[None]
+
+    zenith, azimuth, zenith_tx, azimuth_tx = (column(angle, torch.float32) for angle in angles)
+    return Paths(
+        coeff=column(coeff, torch.complex64),
+        delay=column(delay, torch.float32),
+        aoa_zenith=zenith,
+        aoa_azimuth=azimuth,
+        aod_zenith=zenith_tx,
+        aod_azimuth=azimuth_tx,
+        valid=torch.ones(1, len(rank), dtype=torch.bool),
+        frequency=frequency,
+        tx=tx,
+        rx=rx,
+        order=column(order.astype(np.int64), torch.int64),
+        kind=column(kind.astype(np.int64), torch.int64),
+    )
+
+
+def _check(scene: Scene, tx: Pose, rx: Pose, config: TraceConfig, frequency: float) -> None:
+    """Refuse what cannot be traced, naming the receiver and what is in its way."""
+    if tx.batch_shape or len(rx.batch_shape) != 1:
+        raise InputError(f"tx must be one pose and rx a list [rx]; got {tx.batch_shape} and {rx.batch_shape}")
+    if config.rays < 1 or config.depth < 0:
+        raise InputError(f"rays must be positive and depth not negative; got {config.rays} and {config.depth}")
+    if not 1e8 <= frequency <= 1e12:
+        raise InputError(f"frequency must be in hertz, between 100 MHz and 1 THz; got {frequency:g}")
+    if scene.source is None:
+        scene.check_radio(frequency)
+    for label, position in [("the transmitter", tx.position), *((f"receiver {i}", p) for i, p in enumerate(rx.position))]:
+        place = "(" + ", ".join(f"{value:g}" for value in position.tolist()) + ")"
+        occupant = scene.occupant(position)
+        if occupant == "outside":
+            raise InputError(
+                f"{label} at {place} is outside the scene {scene.name!r}, which spans {scene.bounds[0]} to "
+                f"{scene.bounds[1]} metres; are the positions in metres?"
+            )
+        if occupant is not None:
+            raise InputError(f"{label} at {place} is inside the object {occupant!r}; move it into free space")
+        if label != "the transmitter" and float((position - tx.position).norm()) < 1e-3:
+            raise InputError(f"{label} at {place} is at the transmitter; move it away")
