@@ -115,6 +115,7 @@ def _description(field: RadioField) -> dict[str, Any]:
         "gaussians": len(surface),
         "gain_coefficients": surface.gain_sh.shape[1],
         "encoding": surface.encoding,
+        "delay_span": surface.delay_span,
         "window_db": [surface.window.floor_db, surface.window.ceil_db],
         "frequency": field.frequency,
         "instrument": {
@@ -177,6 +178,7 @@ def _assemble(tensors: Mapping[str, Tensor], body: Mapping[str, Any]) -> RadioFi
         tx=_vector(body["prior_tx"], "prior_tx"),
         window=DbWindow(floor_db, ceil_db),
         encoding=body["encoding"],
+        delay_span=_number(body["delay_span"], "delay_span"),
     )
     sources = tuple(
         PointSource(

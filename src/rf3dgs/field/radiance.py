@@ -36,7 +36,7 @@ class Surface:
     gain_sh `[N, K]`: the gain in window units is 0.5 + SH(view direction), not below 0.
     csi_sh: encoding "vector" `[N, 4, 4]`, degree 1: residuals of the delay [ns] and the departure (world x, y, z) over
         the single-bounce prior; encoding "paper" `[N, 16, 3]`, degree 3: its three channels as 0.5 + SH.
-    tx `[3]`: the transmitter's position [m], for the prior.
+    tx `[3]`: the transmitter's position [m], for the prior. delay_span [s]: what 1 means in the paper's delay channel.
     """
 
     means: Tensor
@@ -48,6 +48,7 @@ class Surface:
     tx: Tensor
     window: DbWindow
     encoding: str = "vector"
+    delay_span: float = 1e-7
 
     def __post_init__(self) -> None:
         if self.encoding not in CSI_CHANNELS:
@@ -71,7 +72,16 @@ class Surface:
         return torch.sigmoid(self.logit_opacities)
 
     @classmethod
-    def bare(cls, geometry: Gaussians, *, tx: Tensor, window: DbWindow, encoding: str = "vector", degree: int = 3):
+    def bare(
+        cls,
+        geometry: Gaussians,
+        *,
+        tx: Tensor,
+        window: DbWindow,
+        encoding: str = "vector",
+        degree: int = 3,
+        delay_span: float = 1e-7,
+    ) -> "Surface":
         """The surface before any spectrum is seen: all harmonics zero, so that every Gaussian is at mid-window."""
         count = len(geometry)
         if encoding not in CSI_CHANNELS:
@@ -87,6 +97,7 @@ class Surface:
             torch.as_tensor(tx, dtype=torch.float32),
             window,
             encoding,
+            delay_span,
         )
 
     def select(self, index: Tensor) -> "Surface":
@@ -163,13 +174,18 @@ class Radiance:
     aod: Tensor | None = None
 
 
-def decode(channels: Tensor, surface: Surface) -> Radiance:
-    """Physical values of composited channels `[*shape, 2 (+ CSI)]`; interpolate channels, not what this returns."""
+def decode(channels: Tensor, surface: Surface, receiver: Tensor) -> Radiance:
+    """Physical values of composited channels `[row, col, 2 (+ CSI)]`; interpolate channels, not what this returns.
+
+    The paper's delays count from the first arrival, which is taken to be the straight way to `receiver` `[3]`.
+    """
     power = surface_power(channels[..., 0], surface.window)
     if channels.shape[-1] == 2:
         return Radiance(power)
     if surface.encoding == "paper":
-        delay, aod = PaperEncoding.of_field(surface.window).decode(channels[..., 0], channels[..., 2:])
+        first = torch.linalg.vector_norm(surface.tx - receiver) / SPEED_OF_LIGHT
+        shown = torch.cat((channels[..., :1], channels[..., 2:]), -1)
+        _, delay, aod = PaperEncoding(surface.window, surface.delay_span).decode(shown, first)
         return Radiance(power, delay, aod)
     weight = channels[..., 1]
     hit = weight > 1e-3

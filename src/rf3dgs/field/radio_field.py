@@ -125,7 +125,7 @@ class RadioField:
         return load_field(path)
 
     def _render_one(self, pose: Pose, grid: DirectionGrid, csi: bool) -> Radiance:
-        surface = decode(self._channels(pose, grid, csi), self.surface)
+        surface = decode(self._channels(pose, grid, csi), self.surface, pose.position)
         if not self.sources:
             return surface
         directions = pose.to_world(grid.directions)

@@ -42,16 +42,14 @@ def ridge_start(
     `ridge` counts in observations: how many of them the neighbourhood's solution is worth.
     """
     count, size = len(surface), (degree + 1) ** 2
-    csi = surface.encoding == "vector" and all(view.delay is not None for view in views)
+    csi = surface.encoding == "vector" and all(view.csi is not None for view in views)
     gain = _Normal(count, size, 1)
     rest = _Normal(count, (CSI_DEGREE["vector"] + 1) ** 2, 4) if csi else None
     for view in views:
         parts = [view.keep[..., None], (view.keep * view.gain)[..., None]]
         if csi:
-            assert view.delay is not None
-            assert view.aod is not None
-            reached = view.keep * view.gain
-            parts += [(reached * view.delay * 1e9)[..., None], reached[..., None] * view.aod]
+            assert view.csi is not None
+            parts += [(view.keep * view.gain)[..., None] * view.csi]
         index, sums, directions = back_project(surface, view, torch.cat(parts, -1), backend)
         total = sums[:, 0]
         weight = total / (total + HALF_WEIGHT)

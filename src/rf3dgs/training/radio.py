@@ -61,8 +61,22 @@ def fit_radio(
     if config.line_of_sight == "source":
         source, seen = fit_line_of_sight(PointSource(where.position, where.position), spectra)
         sources = (fit_opening(source, seen, spectra.pose.position, blockers),)
-    bare = Surface.bare(geometry, tx=where.position, window=window, encoding=config.encoding, degree=config.degree)
-    views = radio_views(spectra, window, sources=[(source, seen) for source in sources], face_size=config.face_size)
+    span = PaperEncoding.of(spectra).delay_span if config.encoding == "paper" and spectra.delay is not None else 1e-7
+    bare = Surface.bare(
+        geometry,
+        tx=where.position,
+        window=window,
+        encoding=config.encoding,
+        degree=config.degree,
+        delay_span=span,
+    )
+    views = radio_views(
+        spectra,
+        window,
+        sources=[(source, seen) for source in sources],
+        encoding=PaperEncoding(window, span) if config.encoding == "paper" else None,
+        face_size=config.face_size,
+    )
     stage = RadioStage(bare, views, config)
     identity = {
         "stage": "radio",
@@ -123,7 +137,7 @@ class RadioStage:
     def __init__(self, bare: Surface, views: Sequence[RadioView], config: RadioConfig) -> None:
         self.bare, self.views, self.config = bare, views, config
         self.reach = reach_of(bare.scales)
-        self.has_csi = all(view.delay is not None for view in views)
+        self.has_csi = all(view.csi is not None for view in views)
         gain_sh, csi_sh = self._start()
         values = {
             "level": gain_sh[:, :1],
@@ -190,13 +204,14 @@ class RadioStage:
             current.tx,
             current.window,
             current.encoding,
+            current.delay_span,
         )
 
     def _surface(self) -> Surface:
         bare, own = self.bare, self.parameters
         gain_sh = torch.cat((own["level"], own["harmonics"]), 1)
         shape = (bare.means, bare.quats, bare.log_scales, own["opacity"], gain_sh, own["csi"])
-        return Surface(*shape, bare.tx, bare.window, bare.encoding)
+        return Surface(*shape, bare.tx, bare.window, bare.encoding, bare.delay_span)
 
     def _start(self) -> tuple[Tensor, Tensor]:
         config, bare = self.config, self.bare
@@ -217,25 +232,22 @@ class RadioStage:
 
     def _csi_loss(self, surface: Surface, view: RadioView, directions: Tensor) -> Tensor:
         """L1 of delay and departure, weighted by what a path reaches: solid angle times gain in the window."""
-        assert view.delay is not None
-        assert view.aod is not None
+        assert view.csi is not None
         values = csi_values(surface, view.camera.position, directions)
         blended, weight = self._raster(surface, values, view, surface.opacities.detach())
         picture = blended / weight.detach().clamp_min(1e-3)[..., None]
         reached = view.keep * view.gain * (weight.detach() > 1e-3)
-        error = (picture[..., 0] - view.delay * 1e9).abs() / DELAY_SCALE_NS + (picture[..., 1:] - view.aod).abs().sum(
-            -1
-        )
+        late, turned = (picture - view.csi).abs().split((1, 3), -1)
+        error = late.squeeze(-1) / DELAY_SCALE_NS + turned.sum(-1)
         return (reached * error).sum() / reached.sum().clamp_min(1e-6)
 
     def _paper_loss(self, surface: Surface, view: RadioView, directions: Tensor) -> Tensor:
         """The paper's channels all in one picture, every one through the opacities."""
         values = gain_values(surface.gain_sh, directions)
         target = view.gain[..., None]
-        if view.delay is not None and view.aod is not None:
+        if view.csi is not None:
             values = torch.cat((values, csi_values(surface, view.camera.position, directions)), -1)
-            encoding = PaperEncoding.of_field(surface.window)
-            target = torch.cat((target, encoding.encode(view.gain, view.delay, view.aod)), -1)
+            target = torch.cat((target, view.csi), -1)
         picture = self._raster(surface, values, view, surface.opacities)[0]
         target = torch.where((view.keep > 0)[..., None], target, picture.detach())
         return l1_ssim(picture, target, ssim_weight=self.config.ssim_weight, weight=view.keep)
