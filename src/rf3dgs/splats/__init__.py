@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rf3dgs.splats.surface import sample_mesh as sample_mesh
     from rf3dgs.splats.transmittance import segment_transmittance as segment_transmittance
 
-__all__ = [
+__all__ = [  # noqa: RUF022
     "Gaussians",
     "Raster",
     "rasterize",
@@ -35,7 +35,7 @@ __all__ = [
     "read_ply",
     "write_ply",
     "read_point_cloud",
-]  # noqa: RUF022 (reading order)
+]
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
