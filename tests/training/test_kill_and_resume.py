@@ -10,10 +10,17 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file
 
+SLOW = """
+import time
+
+class Slow:
+    def start(self, label, total, done=0): print("from", done, flush=True)
+    def update(self, done, note=""): time.sleep(0.01)
+    def finish(self, note=""): pass
+"""
+
 VISUAL = """
-import math, os, sys, time
-from pathlib import Path
-import torch
+import math, sys
 from safetensors.torch import save_file
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, pinhole_grid
@@ -33,18 +40,43 @@ config = VisualConfig(
     grow_gradient=1e-5, reset_every=50,
 )
 
-class Slow:
-    def start(self, label, total, done=0): print("from", done, flush=True)
-    def update(self, done, note=""): time.sleep(0.01)
-    def finish(self, note=""): pass
-
 geometry = fit_geometry(photos, config, progress=Slow(), checkpoint_dir=None if checkpoints == "none" else checkpoints)
 save_file(geometry.tensors(), out)
 """
 
 
+RADIO = """
+import sys
+import torch
+from safetensors.torch import save_file
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import equirect_grid
+from rf3dgs.spectra.spectrum import Instrument, Spectrum
+from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.training.config import RadioConfig
+from rf3dgs.training.radio import fit_radio
+
+out, checkpoints = sys.argv[1:]
+generator = torch.Generator().manual_seed(5)
+geometry = Gaussians.random(60, (-2, -2, 0), (2, 2, 2), degree=0, seed=4)
+pose = Pose(torch.rand(3, 3, generator=generator) - 0.5 + torch.tensor([0.0, 0.0, 1.0]))
+tx = Pose((1.5, 1.5, 1.8))
+grid = equirect_grid(24, 12)
+aod = torch.nn.functional.normalize(torch.randn(3, 12, 24, 3, generator=generator), dim=-1)
+spectra = Spectrum(
+    10 ** (-8 - 4 * torch.rand(3, 12, 24, generator=generator)), grid, pose, 60e9, Instrument.gaussian(0.4),
+    delay=1e-8 * (1 + torch.rand(3, 12, 24, generator=generator)), aod=aod, tx=tx,
+)
+config = RadioConfig(steps=150, checkpoint_every=10)
+folder = None if checkpoints == "none" else checkpoints
+field = fit_radio(geometry, spectra, config, progress=Slow(), checkpoint_dir=folder)
+seen = field.render(pose, grid)
+save_file({"power": seen.power, "delay": seen.delay, "aod": seen.aod}, out)
+"""
+
+
 def run(script: str, out: Path, checkpoints: Path | str) -> subprocess.Popen:
-    command = [sys.executable, "-c", script, str(out), str(checkpoints)]
+    command = [sys.executable, "-c", SLOW + script, str(out), str(checkpoints)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
 
@@ -82,3 +114,7 @@ def assert_killed_equals_uninterrupted(script: str, tmp_path: Path, kills: tuple
 
 def test_the_visual_stage_survives_sigkill_bit_by_bit(tmp_path):
     assert_killed_equals_uninterrupted(VISUAL, tmp_path, (20, 70))
+
+
+def test_the_radio_stage_survives_sigkill_bit_by_bit(tmp_path):
+    assert_killed_equals_uninterrupted(RADIO, tmp_path, (20, 70))
