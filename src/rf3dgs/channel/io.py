@@ -3,7 +3,7 @@
 Layout, version 1. `offset` `[rx + 1]`: the paths of receiver i are the entries `offset[i]` to `offset[i + 1]` of every
 column. Columns: `coeff_real`, `coeff_imag`, `delay` [s], `aoa_zenith`, `aoa_azimuth`, `aod_zenith`, `aod_azimuth`
 [rad], and, where known, `order` and `kind`. `rx_position` `[rx, 3]` [m], `rx_orientation` `[rx, 4]` (wxyz). The columns
-are compressed by gzip and shuffle and carry fletcher32 checksums. MATLAB reads such a file with `h5read`.
+are compressed by gzip and shuffle; every dataset carries fletcher32 checksums. MATLAB reads such a file with `h5read`.
 """
 
 import json
@@ -121,11 +121,15 @@ class PathsWriter:
         file = self._file
         if not self._rx:
             raise InputError(f"no receiver was written to {self.path}; append the paths of at least one")
-        file["offset"] = np.asarray(self._offset, dtype=np.int64)
-        file["rx_position"] = torch.stack([rx.position for rx in self._rx]).numpy()
-        file["rx_orientation"] = torch.stack([rx.orientation for rx in self._rx]).numpy()
-        file["tx_position"] = self.tx.position.numpy()
-        file["tx_orientation"] = self.tx.orientation.numpy()
+        head = {
+            "offset": np.asarray(self._offset, dtype=np.int64),
+            "rx_position": torch.stack([rx.position for rx in self._rx]).numpy(),
+            "rx_orientation": torch.stack([rx.orientation for rx in self._rx]).numpy(),
+            "tx_position": self.tx.position.numpy(),
+            "tx_orientation": self.tx.orientation.numpy(),
+        }
+        for name, value in head.items():
+            file.create_dataset(name, data=value, fletcher32=True)
         file.attrs.update(CONVENTIONS)
         file.attrs["schema"] = SCHEMA
         file.attrs["version"] = VERSION

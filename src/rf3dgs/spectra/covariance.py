@@ -15,6 +15,7 @@ from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.spectra.synthesis import pose_for
 
 AT_ONCE = 2**22  # complex numbers of an intermediate result
+FEW = 4_096  # up to so many paths coherent sums are made in complex128, beyond in complex64 (-140 dB of the strongest)
 MANY = 65_536  # more paths of one receiver than this are merged first
 
 
@@ -105,7 +106,8 @@ def _responses(paths: Paths, array: PlanarArray, world_from_device: Tensor, offs
     x = torch.zeros(array.count, len(offsets), dtype=torch.complex128)
     coeff, directions = coefficients(paths), paths.aoa @ world_from_device
     arriving = torch.nonzero(coeff != 0).squeeze(-1)
+    precision = torch.complex64 if len(arriving) > FEW else torch.complex128
     for part in arriving.split(max(1, AT_ONCE // (array.count + len(offsets)))):
         steering = manifold(array, directions[part].double()) * coeff[part][:, None]
-        x += steering.mT @ delay_phase(paths.delay[part], offsets)
+        x += steering.to(precision).mT @ delay_phase(paths.delay[part], offsets).to(precision)
     return x
