@@ -3,16 +3,46 @@
 from pathlib import Path
 
 from rf3dgs.core.errors import DataError
-from rf3dgs.data.formats import nerfstudio
+from rf3dgs.data.formats.blender import files_of, read_blender
+from rf3dgs.data.formats.colmap import model_folder, read_colmap
+from rf3dgs.data.formats.nerfstudio import FILE_NAME, read_nerfstudio
+from rf3dgs.data.formats.rf3dgs_v0 import is_rf3dgs_v0, read_rf3dgs_v0_pictures
 from rf3dgs.data.photo import PhotoSet
+
+LAYOUTS = ("native", "nerfstudio", "blender", "rf3dgs_v0", "colmap")
+
+
+def layout_of(path: str | Path) -> str | None:
+    """The layout of a folder, one of `LAYOUTS`, or None: the first whose files are there."""
+    path = Path(path)
+    if (path / "dataset.json").is_file():
+        return "native"
+    if (path / FILE_NAME).is_file():
+        return "nerfstudio"
+    if files_of(path):
+        return "blender"
+    if model_folder(path) is None:
+        return "nerfstudio" if (path / "photos" / FILE_NAME).is_file() else None
+    return "rf3dgs_v0" if is_rf3dgs_v0(path) else "colmap"
 
 
 def read_photos(path: str | Path) -> PhotoSet:
     """Read the photos of a folder in whatever known layout it has; `layout` of the result says which."""
     path = Path(path)
-    if not path.exists():
+    if not path.is_dir():
         raise DataError(f"{path}: there is no such folder")
-    for folder in (path, path / "photos"):
-        if (folder / nerfstudio.FILE_NAME).is_file():
-            return nerfstudio.read_nerfstudio(folder)
-    raise DataError(f"{path}: found no COLMAP, nerfstudio, Blender, rf3dgs_v0 or dataset layout there")
+    layout = layout_of(path)
+    if layout in ("native", "nerfstudio"):
+        folder = path if (path / FILE_NAME).is_file() else path / "photos"
+        found = read_nerfstudio(folder)
+        return PhotoSet(found.photos, layout, notes=found.notes)
+    if layout == "blender":
+        return read_blender(path)
+    if layout == "rf3dgs_v0":
+        return read_rf3dgs_v0_pictures(path)
+    if layout == "colmap":
+        return read_colmap(path)
+    raise DataError(
+        f"{path}: expected photos as COLMAP (sparse/0), nerfstudio (transforms.json), Blender (transforms_train.json), "
+        "rf3dgs_v0 (train_index.txt) or a dataset (dataset.json); found none of these"
+    )

@@ -15,7 +15,7 @@ from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import opengl_from_viewmat, viewmat_from_opengl
 from rf3dgs.core.grids import Camera
 from rf3dgs.data.photo import Photo, PhotoSet, check_camera, photo_of_file
-from rf3dgs.data.safe import inside, picture_size, read_json, write_json
+from rf3dgs.data.safe import PICTURE_SUFFIXES, inside, picture_size, read_json, write_json
 
 FILE_NAME = "transforms.json"
 MAX_FRAMES = 1_000_000
@@ -28,12 +28,7 @@ def read_nerfstudio(path: str | Path) -> PhotoSet:
     path = Path(path)
     file = path / FILE_NAME if path.is_dir() else path
     content = read_json(file)
-    photos = []
-    for index, frame in enumerate(frames_of(content, file)):
-        where = f"{file}: frame {index}"
-        picture = inside(file.parent, frame.get("file_path"), named_in=file)
-        camera = _camera(content | frame, matrix_of(frame, where), picture, where)
-        photos.append(photo_of_file(str(frame["file_path"]).removeprefix("./"), camera, picture))
+    photos = [photo_of_frame(content, frame, index, file) for index, frame in enumerate(frames_of(content, file))]
     notes = []
     if "applied_transform" in content:
         notes.append("the file's world was moved by its applied_transform; poses are used as they stand in the file")
@@ -61,6 +56,17 @@ def write_nerfstudio(path: str | Path, photos: Sequence[Photo], *, names: Sequen
             content |= shared
             frames = [{key: value for key, value in frame.items() if key not in shared} for frame in frames]
     write_json(file, content | {"frames": frames})
+
+
+def photo_of_frame(content: dict[str, Any], frame: dict[str, Any], index: int, file: Path) -> Photo:
+    """The photo of one frame; its own intrinsics come before the whole file's, and its file name may lack a suffix."""
+    where = f"{file}: frame {index}"
+    picture = inside(file.parent, frame.get("file_path"), named_in=file)
+    if picture.suffix.lower() not in PICTURE_SUFFIXES:
+        named = [picture.with_name(picture.name + suffix) for suffix in PICTURE_SUFFIXES]
+        picture = next((candidate for candidate in named if candidate.is_file()), named[-1])
+    camera = _camera(content | frame, matrix_of(frame, where), picture, where)
+    return photo_of_file(str(frame["file_path"]).removeprefix("./"), camera, picture)
 
 
 def frames_of(content: dict[str, Any], file: Path) -> list[dict[str, Any]]:

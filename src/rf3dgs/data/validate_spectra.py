@@ -1,0 +1,151 @@
+"""What can be wrong with `spectra.h5`: damage, poses, empty or constant spectra, and units by plausibility."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+from scipy.spatial import KDTree
+
+from rf3dgs.core.errors import DataError
+from rf3dgs.core.hdf5 import open_audited, read_array, read_attribute
+from rf3dgs.core.units import SPEED_OF_LIGHT
+from rf3dgs.data.formats.spectra_h5 import read_spectra
+
+Found = Iterator[tuple[str, str]]
+
+MAX_GAIN_DB = 30.0
+MAX_EXTENT = 1000.0  # [m] beyond it, positions without a delay that explains them are taken for millimetres
+MAX_DELAY = 1e-3  # [s] 300 km
+
+
+def spectra_faults(path: Path) -> Found:
+    """Pairs (what, remedy) for one file of spectra; the values are looked at raw, so that one fault hides no other."""
+    again = "Write the spectra again"
+    try:
+        with open_audited(path) as file:
+            for name in ("spectra", "repeat"):
+                group = file.get(name)
+                if isinstance(group, h5py.Group):
+                    yield from _group_faults(group, name)
+                elif name == "spectra":
+                    yield "the group 'spectra' is missing", again
+    except DataError as error:
+        yield _sentence(path, error), again
+        return
+    try:
+        read_spectra(path)
+    except DataError as error:
+        yield _sentence(path, error), again
+
+
+def _group_faults(group: h5py.Group, name: str) -> Found:
+    positions, orientations = read_array(group, "position"), read_array(group, "orientation")
+    gain, some = _scaled(group, "gain")
+    counts = {"position": len(positions), "orientation": len(orientations), "gain": len(gain)}
+    if len(set(counts.values())) > 1:
+        listed = ", ".join(f"{count} of {key}" for key, count in counts.items())
+        yield f"{name}: counts differ: {listed}", "Write one pose per spectrum"
+        return
+    yield from _pose_faults(positions, orientations, name)
+    yield from _gain_faults(gain, some, name)
+    lobe = read_attribute(group, "lobe")
+    if isinstance(lobe, int | float) and lobe > 2 * np.pi:
+        yield (
+            f"{name}: the lobe is {lobe:.3g}, more than a full turn in radians",
+            "It is in degrees; convert to radians",
+        )
+    if np.isfinite(positions).all():
+        yield from _scale_faults(group, positions, some, name)
+
+
+def _pose_faults(positions: np.ndarray, orientations: np.ndarray, name: str) -> Found:
+    bad = np.flatnonzero(~np.isfinite(positions).all(1) | ~np.isfinite(orientations).all(1))
+    if len(bad):
+        yield (
+            f"{name}: the pose of spectrum {_some(bad)} is NaN or infinite",
+            "Remove those spectra or mend their poses",
+        )
+    length = np.linalg.norm(np.nan_to_num(orientations, nan=1.0), axis=1)
+    zero = np.flatnonzero(length < 1e-6)
+    if len(zero):
+        yield f"{name}: the quaternion of spectrum {_some(zero)} is zero", "Write (1, 0, 0, 0) for no rotation"
+    scaled = np.setdiff1d(np.flatnonzero(np.abs(length - 1.0) > 1e-3), np.concatenate((zero, bad)))
+    if len(scaled):
+        yield f"{name}: the quaternion of spectrum {_some(scaled)} is not of unit length", "Normalise it to length 1"
+    finite = np.setdiff1d(np.arange(len(positions)), bad)
+    pose = np.concatenate((positions, orientations), 1)[finite]
+    for first, second in sorted(KDTree(pose).query_pairs(1e-3)) if len(pose) > 1 else ():
+        low, high = finite[first], finite[second]
+        yield f"{name}: spectra {low} and {high} have one pose", "Remove one of the two duplicates"
+        return
+
+
+def _gain_faults(gain: np.ndarray, some: np.ndarray, name: str) -> Found:
+    flat, known = gain.reshape(len(gain), -1), some.reshape(len(some), -1)
+    empty = np.flatnonzero(~known.any(1))
+    if len(empty):
+        yield f"{name}: spectrum {_some(empty)} is empty, no power arrives", "Remove it, or trace that receiver again"
+    low = np.where(known, flat, np.inf).min(1, initial=np.inf)
+    high = np.where(known, flat, -np.inf).max(1, initial=-np.inf)
+    constant = np.flatnonzero(known.all(1) & (high - low < 1e-6))
+    if len(constant):
+        what = f"{name}: spectrum {_some(constant)} is constant, the same in every direction"
+        yield what, "Remove it, or measure or trace it again"
+    if not known.any():
+        return
+    peak, least = float(high.max()), float(low.min())
+    if peak > MAX_GAIN_DB:
+        what = f"{name}: the gain reaches {peak:.1f} dB, which no path gain does"
+        yield what, "It is a level in dBm or another unit; subtract the transmit power and store dB"
+    elif least >= 0.0 and peak <= 1.0 and peak > least:
+        what = f"{name}: all gains lie between {least:.3g} and {peak:.3g} dB, as linear power does"
+        yield what, "It is linear power; store 10 log10 of it"
+
+
+def _scale_faults(group: h5py.Group, positions: np.ndarray, some: np.ndarray, name: str) -> Found:
+    """Positions against delays: light needs distance / c at least."""
+    metres = "Positions must be in metres and delays in seconds; convert and write them again"
+    first = None
+    if "delay" in group:
+        delay, known = _scaled(group, "delay")
+        known = known & some
+        if known.any() and float(delay[known].max()) > MAX_DELAY:
+            yield f"{name}: delays reach {float(delay[known].max()):.3g} s, the way of light over 300 km", metres
+            return
+        if known.any() and float(delay[known].min()) < 0.0:
+            yield f"{name}: delays are negative, down to {float(delay[known].min()):.3g} s", metres
+            return
+        first = np.where(known, delay, np.inf).reshape(len(delay), -1).min(1, initial=np.inf)
+    if first is not None and "tx_position" in group:
+        distance = np.linalg.norm(positions - read_array(group, "tx_position").reshape(-1, 3)[:1], axis=1)
+        early = np.flatnonzero(np.isfinite(first) & (first * SPEED_OF_LIGHT < 0.9 * distance - 0.05))
+        if len(early):
+            index = early[0]
+            yield (
+                f"{name}: spectrum {_some(early)} arrives before light could: {first[index]:.3g} s for "
+                f"{distance[index]:.4g} m from the transmitter",
+                metres,
+            )
+        return
+    extent = float(np.ptp(positions, axis=0).max()) if len(positions) else 0.0
+    if extent > MAX_EXTENT:
+        yield f"{name}: positions span {extent:.4g} m, more than {MAX_EXTENT:.0f} m; are they millimetres?", metres
+
+
+def _scaled(group: h5py.Group, name: str) -> tuple[np.ndarray, np.ndarray]:
+    codes = read_array(group, name)
+    item = group[name]
+    scale, offset, missing = (
+        np.float64(np.asarray(read_attribute(item, key))) for key in ("scale", "offset", "missing")
+    )
+    return codes * scale + offset, codes != missing
+
+
+def _some(indices: np.ndarray) -> str:
+    """The first of many, and how many more."""
+    return f"{indices[0]}" + (f" (and {len(indices) - 1} more)" if len(indices) > 1 else "")
+
+
+def _sentence(path: Path, error: Exception) -> str:
+    return str(error).removeprefix(f"{path}: ").rstrip(".")
