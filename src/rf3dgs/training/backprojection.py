@@ -101,8 +101,8 @@ class _Normal:
 def _cells(surface: Surface, size: float) -> Tensor:
     """A number `[N]` for each cell of `size` [m] and main axis of the normal, so that a floor and a wall stay apart."""
     place = torch.floor(surface.means / size).long()
-    rotation = matrix_from_quaternion(torch.nn.functional.normalize(surface.quats, dim=-1))
-    shortest = surface.log_scales.argmin(-1)
-    normal = rotation.gather(2, shortest[:, None, None].expand(-1, 3, 1)).squeeze(-1)
+    axes = matrix_from_quaternion(surface.quats)
+    shortest = surface.log_scales.argmin(-1)[:, None, None].expand(-1, 3, 1)
+    normal = axes.gather(-1, shortest).squeeze(-1)
     key = torch.cat((place, normal.abs().argmax(-1, keepdim=True)), -1)
     return torch.unique(key, dim=0, return_inverse=True)[1]

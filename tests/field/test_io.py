@@ -1,0 +1,117 @@
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from rf3dgs.core.errors import DataError, InputError
+from rf3dgs.core.frames import Pose
+from rf3dgs.field.io import load_field, save_field
+from rf3dgs.field.radio_field import RadioField
+
+HERE = Pose([4.0, 3.0, 1.4])
+
+
+@pytest.fixture
+def saved(field, tmp_path):
+    path = tmp_path / "room.field"
+    field.save(path)
+    return path
+
+
+def test_a_field_comes_back_from_disk(field, saved, sphere):
+    before, after = field.render(HERE, sphere), RadioField.load(saved).render(HERE, sphere)
+    error = (before.gain_db - after.gain_db).abs()
+    assert float(error.mean()) < 0.05
+    assert float(error.max()) < 0.5
+    assert before.delay is not None
+    assert after.delay is not None
+    torch.testing.assert_close(before.delay, after.delay, atol=5e-11, rtol=0)
+    assert RadioField.load(saved).meta == field.meta
+
+
+def test_saving_what_was_loaded_changes_nothing(saved, tmp_path):
+    once = load_field(saved)
+    save_field(once, tmp_path / "again.field")
+    assert (tmp_path / "again.field" / "tensors.safetensors").read_bytes() == (
+        saved / "tensors.safetensors"
+    ).read_bytes()
+
+
+def test_a_field_takes_at_most_a_hundred_bytes_a_gaussian(field, saved):
+    size = (saved / "tensors.safetensors").stat().st_size - 2_000
+    assert size / len(field.surface) < 100
+
+
+def test_every_flipped_byte_is_noticed(saved):
+    generator = torch.Generator().manual_seed(0)
+    for name in ("field.json", "tensors.safetensors"):
+        good = (saved / name).read_bytes()
+        places = torch.randint(len(good) - 1, (40,), generator=generator).tolist()
+        for place in places:
+            bad = bytearray(good)
+            bad[place] ^= 0x21
+            if name == "field.json" and bad[place] in b" \n" and good[place] in b" \n":
+                continue
+            (saved / name).write_bytes(bytes(bad))
+            with pytest.raises(DataError, match=r"room\.field"):
+                load_field(saved)
+        (saved / name).write_bytes(good)
+    load_field(saved)
+
+
+@pytest.mark.parametrize("name", ["field.json", "tensors.safetensors"])
+def test_truncated_and_missing_files_are_named(saved, name):
+    data = (saved / name).read_bytes()
+    (saved / name).write_bytes(data[: len(data) // 2])
+    with pytest.raises(DataError, match=name):
+        load_field(saved)
+    (saved / name).unlink()
+    with pytest.raises(DataError, match=name):
+        load_field(saved)
+    with pytest.raises(DataError, match="no such field"):
+        load_field(saved / "nowhere")
+
+
+def change(saved, edit):
+    """Edit the description and give it a right checksum again: a well-formed file with wrong contents."""
+    from rf3dgs.field.io import _digest
+
+    record = json.loads((saved / "field.json").read_text())
+    edit(record["body"])
+    record["sha256"] = _digest(record["body"])
+    (saved / "field.json").write_text(json.dumps(record))
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda body: body.update(schema=99), "expected a field of schema 1; got 99"),
+        (lambda body: body.pop("window_db"), "window_db"),
+        (lambda body: body.update(gaussians=7), "must be"),
+        (lambda body: body.update(encoding="polar"), "polar"),
+        (lambda body: body.update(frequency=True), "frequency must be a finite number"),
+        (lambda body: body.update(bounds=[[0, 0], [1, 1]]), "bounds must be three numbers"),
+        (lambda body: body["tx"].update(orientation=[0, 0, 0, 0]), "zero or non-finite quaternion"),
+    ],
+)
+def test_wrong_descriptions_are_refused(saved, edit, message):
+    change(saved, edit)
+    with pytest.raises(DataError, match=message):
+        load_field(saved)
+
+
+def test_fields_that_are_not_finite_are_not_saved(field, tmp_path):
+    gain_sh = field.surface.gain_sh.clone()
+    gain_sh[3, 2] = float("nan")
+    with pytest.raises(InputError, match="gain_sh has NaN"):
+        save_field(replace(field, surface=replace(field.surface, gain_sh=gain_sh)), tmp_path / "bad.field")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_no_field_is_not_overwritten(field, tmp_path):
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "diary.txt").write_text("keep me")
+    with pytest.raises(InputError, match="something else than a field"):
+        save_field(field, tmp_path / "notes")
+    assert (tmp_path / "notes" / "diary.txt").read_text() == "keep me"
