@@ -6,6 +6,7 @@ import torch
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import matrix_from_quaternion
 from rf3dgs.splats.surface import normals, sample_mesh
+from rf3dgs.splats.transmittance import segment_transmittance
 
 
 def box(*size: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -18,6 +19,17 @@ def box(*size: float) -> tuple[torch.Tensor, torch.Tensor]:
 def square(size: float = 2.0) -> tuple[torch.Tensor, torch.Tensor]:
     corners = torch.tensor([[0.0, 0.0, 0.0], [size, 0.0, 0.0], [size, size, 0.0], [0.0, size, 0.0]])
     return corners, torch.tensor([[0, 1, 2], [0, 2, 3]])
+
+
+def sphere() -> tuple[torch.Tensor, torch.Tensor]:
+    """A sphere of radius 1 m and 3,200 triangles with edges of up to 16 cm."""
+    zenith = torch.linspace(0, math.pi, 41)
+    azimuth = torch.arange(40) * (2 * math.pi / 40)
+    z, a = torch.meshgrid(zenith, azimuth, indexing="ij")
+    vertices = torch.stack((torch.sin(z) * torch.cos(a), torch.sin(z) * torch.sin(a), torch.cos(z)), -1).reshape(-1, 3)
+    i, j = torch.meshgrid(torch.arange(40), torch.arange(40), indexing="ij")
+    p, q = i * 40 + j, i * 40 + (j + 1) % 40
+    return vertices, torch.cat((torch.stack((p, p + 40, q), -1), torch.stack((q, p + 40, q + 40), -1))).reshape(-1, 3)
 
 
 @pytest.mark.parametrize("count", [300, 5000, 40_000])
@@ -96,18 +108,17 @@ def test_each_face_gives_its_colour() -> None:
 
 
 def test_tiny_triangles_are_sampled_by_their_area() -> None:
-    """A sphere of 3,200 triangles with edges of a third of the spacing."""
-    zenith = torch.linspace(0, math.pi, 41)
-    azimuth = torch.arange(40) * (2 * math.pi / 40)
-    z, a = torch.meshgrid(zenith, azimuth, indexing="ij")
-    vertices = torch.stack((torch.sin(z) * torch.cos(a), torch.sin(z) * torch.sin(a), torch.cos(z)), -1).reshape(-1, 3)
-    i, j = torch.meshgrid(torch.arange(40), torch.arange(40), indexing="ij")
-    p, q = i * 40 + j, i * 40 + (j + 1) % 40
-    faces = torch.cat((torch.stack((p, p + 40, q), -1), torch.stack((q, p + 40, q + 40), -1))).reshape(-1, 3)
-    cloud = sample_mesh(vertices, faces, spacing=0.25)
+    cloud = sample_mesh(*sphere(), spacing=0.25)
     expected = 4 * math.pi / (0.25**2 * math.sqrt(3) / 2)
     assert abs(len(cloud) - expected) < 5 * math.sqrt(expected)
     assert float((normals(cloud) * cloud.means).sum(-1).min()) > 0.97
+
+
+def test_curved_surfaces_have_hardly_a_hole() -> None:
+    cloud = sample_mesh(*sphere(), count=4000)
+    away = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
+    passed = segment_transmittance(cloud.means, cloud.quats, cloud.scales, cloud.opacities, torch.zeros(1, 3), 2 * away)
+    assert float((passed > 0.1).float().mean()) < 0.01
 
 
 def test_faces_without_area_are_left_out() -> None:

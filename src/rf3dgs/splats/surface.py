@@ -16,6 +16,7 @@ from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import C0, coefficient_count
 
 ALONG = 0.7  # tangential scale / spacing: at the middle of three neighbours the transmittance is 0.03
+LOOSE = 0.9  # the same on planes of only a few points, such as facets of a curved surface, where no lattice helps
 ACROSS = 0.35  # scale / spacing across an edge
 INSET = 0.3  # distance / spacing of an edge's row from the edge
 JITTER = 0.1  # largest displacement / spacing of a lattice point, against moire
@@ -65,20 +66,24 @@ def sample_mesh(
     if len(real) == 0:
         raise InputError("the mesh has no face with an area; check the units (metres) and the indices of its faces")
     normal = torch.nn.functional.normalize(normal[real], dim=-1)
-    edges = _edges(corners[real], normal)
+    corners = corners[real]
+    edges, plane = _edges(corners, normal), _planes(corners, normal)
     total = float(area.sum())
     step = math.sqrt(2 / math.sqrt(3) * total / count) if count is not None else float(spacing or 0.0)
-    means, axes, face, is_edge = _sample(corners[real], normal, edges, _affordable(step, total), seed)
+    means, axes, face, is_edge = _sample(corners, normal, edges, plane, _affordable(step, total), seed)
     for _ in range(4):
         if count is None or abs(len(means) - count) <= 0.005 * count:
             break
         step *= math.sqrt(max(len(means), 1) / count)
-        means, axes, face, is_edge = _sample(corners[real], normal, edges, _affordable(step, total), seed)
+        means, axes, face, is_edge = _sample(corners, normal, edges, plane, _affordable(step, total), seed)
     if len(means) == 0:
         raise InputError(f"no Gaussian fits on the mesh at a spacing of {step:.3g} m; ask for more or space closer")
 
     scales = torch.full((len(means), 3), ALONG * step)
     scales[is_edge, 1] = ACROSS * step
+    of_plane = torch.zeros(int(plane.max()) + 1, dtype=area.dtype).index_add_(0, plane, area[real])
+    loose = (of_plane[plane] < 4 * step**2)[face] & ~is_edge
+    scales[loose, :2] = LOOSE * step
     scales[:, 2] = min(thickness, 0.2 * step)
     sh = torch.zeros(len(means), coefficient_count(degree), shade.shape[1])
     sh[:, 0] = (shade[real[face]] - 0.5) / C0
@@ -106,11 +111,11 @@ def _affordable(step: float, area: float) -> float:
 
 
 def _sample(
-    corners: Tensor, normal: Tensor, edges: tuple[Tensor, Tensor], step: float, seed: int
+    corners: Tensor, normal: Tensor, edges: tuple[Tensor, Tensor], plane: Tensor, step: float, seed: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points `[point, 3]`, axes `[point, 3, 3]` (columns), faces `[point]` and who lies on an edge's row `[point]`."""
     generator = torch.Generator().manual_seed(seed)
-    inside, face = _lattice(corners, normal, step, generator)
+    inside, face = _lattice(corners, normal, plane, step, generator)
     far = _distance_to_edges(inside, face, corners, edges) > 0.5 * (INSET + ALONG) * step
     inside, face = inside[far], face[far]
     rows, row_axes, row_face = _edge_rows(corners, normal, edges, step, generator)
@@ -133,7 +138,15 @@ def _plane_axes(normal: Tensor) -> Tensor:
     return torch.stack((torch.linalg.cross(other, normal, dim=-1), other, normal), -1)
 
 
-def _lattice(corners: Tensor, normal: Tensor, step: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def _planes(corners: Tensor, normal: Tensor) -> Tensor:
+    """Numbers `[face]` that triangles of one plane, facing the same side, have in common."""
+    offset = (corners[:, 0] * normal).sum(-1, keepdim=True)
+    return torch.unique(torch.cat((normal, offset), -1).mul(1e4).round(), dim=0, return_inverse=True)[1]
+
+
+def _lattice(
+    corners: Tensor, normal: Tensor, plane: Tensor, step: float, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
     """Points of a hexagonal lattice inside each triangle, found row by row, and the triangle of each.
 
     Every plane has its own random phase, so that the many planes of a curved surface are sampled evenly on average.
@@ -141,8 +154,6 @@ def _lattice(corners: Tensor, normal: Tensor, step: float, generator: torch.Gene
     axes = _plane_axes(normal)
     height = 0.5 * math.sqrt(3) * step
     local = corners @ axes
-    planes = torch.cat((normal, local[:, 0, 2:]), -1).mul(1e4).round()
-    plane = torch.unique(planes, dim=0, return_inverse=True)[1]
     shift = torch.rand(int(plane.max()) + 1, 2, generator=generator, dtype=torch.float64)[plane]
     x, y = local[..., 0] / step - shift[:, :1], local[..., 1] / height - shift[:, 1:]
     first, last = y.amin(-1).ceil().long(), y.amax(-1).ceil().long()
