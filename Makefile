@@ -60,7 +60,7 @@ bench: $(VENV)/test.stamp
 	$(BIN)/python -m pytest benchmarks/speed --benchmark-only --benchmark-columns=min,median,rounds
 
 twin: $(VENV)/test.stamp
-	$(BIN)/python -m benchmarks.twin
+	$(BIN)/python tools/build_assets.py
 
 clean:
 	rm -rf build dist $(VENV) $(OUT)

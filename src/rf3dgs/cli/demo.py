@@ -41,7 +41,7 @@ class Demo:
     """How paths are traced."""
     photo_config: PhotoConfig = field(default_factory=PhotoConfig)
     """How photographs are rendered."""
-    visual: VisualConfig = field(default_factory=VisualConfig)
+    visual: VisualConfig = field(default_factory=lambda: VisualConfig(steps=3000, max_count=40_000))
     """The visual stage."""
     radio: RadioConfig = field(default_factory=RadioConfig)
     """The radio stage."""
