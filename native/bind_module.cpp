@@ -1,8 +1,218 @@
+// What Python sees. Arrays are float32, C-contiguous, on the CPU and never converted: the Python side prepares them and
+// checks shapes, this file only refuses what could read past an end. The GIL is released while the core works.
 #include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/unique_ptr.h>
+
+#include <cmath>
+#include <optional>
+#include <stdexcept>
+#include <thread>
+
+#include "core/thread_pool.hpp"
+#include "splats/constants.hpp"
+#include "splats/image_loss.hpp"
+#include "splats/kernels.hpp"
+#include "splats/rasterize.hpp"
 
 namespace nb = nanobind;
+using namespace nb::literals;
+using namespace rf3dgs;
+
+namespace {
+
+template <int... Shape>
+using In = nb::ndarray<const float, nb::shape<Shape...>, nb::c_contig, nb::device::cpu>;
+template <int... Shape>
+using Out = nb::ndarray<float, nb::shape<Shape...>, nb::c_contig, nb::device::cpu>;
+
+void require(bool fine, const char* message) {
+  if (!fine) throw std::invalid_argument(message);
+}
+
+template <class Array>
+auto* data_or_null(const std::optional<Array>& array) {
+  return array ? array->data() : nullptr;
+}
+
+View view_of(const In<4, 4>& viewmat, const In<3, 3>& camera, int width, int height) {
+  require(width > 0 && height > 0, "a picture needs at least one pixel each way");
+  View view{};
+  const float* m = viewmat.data();
+  const float* k = camera.data();
+  for (int row = 0; row < 3; ++row) {
+    for (int col = 0; col < 3; ++col) view.rotation[3 * row + col] = m[4 * row + col];
+    view.translation[row] = m[4 * row + 3];
+  }
+  view.fx = k[0];
+  view.fy = k[4];
+  view.cx = k[2];
+  view.cy = k[5];
+  view.width = width;
+  view.height = height;
+  view.u_low = -kFieldClamp * view.cx / view.fx;
+  view.u_high = kFieldClamp * (width - view.cx) / view.fx;
+  view.v_low = -kFieldClamp * view.cy / view.fy;
+  view.v_high = kFieldClamp * (height - view.cy) / view.fy;
+  return view;
+}
+
+Parameters parameters_of(const In<-1, 3>& means, const In<-1, 4>& quats, const In<-1, 3>& scales, const In<-1>& opacities,
+                         const In<-1, -1>& values, const std::optional<In<-1, 2>>& offset) {
+  const size_t count = means.shape(0);
+  require(quats.shape(0) == count && scales.shape(0) == count && opacities.shape(0) == count &&
+              values.shape(0) == count && (!offset || offset->shape(0) == count),
+          "all arrays need one row per Gaussian");
+  require(count < (size_t{1} << 31), "too many Gaussians");
+  require(values.shape(1) > 0, "values need at least one channel");
+  return {means.data(),     quats.data(),  scales.data(), opacities.data(), data_or_null(offset),
+          values.data(), static_cast<int>(values.shape(1))};
+}
+
+std::unique_ptr<Scene> forward(In<-1, 3> means, In<-1, 4> quats, In<-1, 3> scales, In<-1> opacities, In<-1, -1> values,
+                               In<4, 4> viewmat, In<3, 3> camera, std::optional<In<-1>> background,
+                               std::optional<In<-1, 2>> offset, Out<-1, -1, -1> picture, Out<-1, -1> weight,
+                               Out<-1> radii, int threads) {
+  const Parameters in = parameters_of(means, quats, scales, opacities, values, offset);
+  const size_t height = picture.shape(0), width = picture.shape(1);
+  require(picture.shape(2) == values.shape(1) && weight.shape(0) == height && weight.shape(1) == width &&
+              radii.shape(0) == means.shape(0) && (!background || background->shape(0) == values.shape(1)),
+          "outputs do not fit the inputs");
+  const View view = view_of(viewmat, camera, static_cast<int>(width), static_cast<int>(height));
+  nb::gil_scoped_release released;
+  return rasterize(view, means.shape(0), in, data_or_null(background), threads, picture.data(), weight.data(),
+                   radii.data());
+}
+
+void backward(const Scene& scene, In<-1, 3> means, In<-1, 4> quats, In<-1, 3> scales, In<-1> opacities,
+              In<-1, -1> values, std::optional<In<-1, 2>> offset, In<-1, -1, -1> picture, In<-1, -1> weight,
+              In<-1, -1, -1> picture_gradient, std::optional<In<-1, -1>> weight_gradient,
+              std::optional<Out<-1, -1>> values_gradient, std::optional<Out<-1>> opacities_gradient,
+              std::optional<Out<-1, 3>> means_gradient, std::optional<Out<-1, 4>> quats_gradient,
+              std::optional<Out<-1, 3>> scales_gradient, std::optional<Out<-1, 2>> offset_gradient, int threads) {
+  const Parameters in = parameters_of(means, quats, scales, opacities, values, offset);
+  const size_t height = scene.view.height, width = scene.view.width, channels = scene.channels;
+  const auto is_picture = [&](const In<-1, -1, -1>& array) {
+    return array.shape(0) == height && array.shape(1) == width && array.shape(2) == channels;
+  };
+  const auto is_map = [&](const In<-1, -1>& array) { return array.shape(0) == height && array.shape(1) == width; };
+  const auto fits = [&](const auto& array) { return !array || array->shape(0) == scene.gaussians; };
+  require(means.shape(0) == scene.gaussians && values.shape(1) == channels && is_picture(picture) &&
+              is_picture(picture_gradient) && is_map(weight) && (!weight_gradient || is_map(*weight_gradient)) &&
+              fits(values_gradient) && (!values_gradient || values_gradient->shape(1) == channels) &&
+              fits(opacities_gradient) && fits(means_gradient) && fits(quats_gradient) && fits(scales_gradient) &&
+              fits(offset_gradient),
+          "gradients do not fit the scene");
+  require(means_gradient.has_value() == quats_gradient.has_value() &&
+              means_gradient.has_value() == scales_gradient.has_value(),
+          "gradients of means, quats and scales come together");
+  const Gradients out = {data_or_null(values_gradient), data_or_null(opacities_gradient), data_or_null(means_gradient),
+                         data_or_null(quats_gradient),  data_or_null(scales_gradient),    data_or_null(offset_gradient)};
+  nb::gil_scoped_release released;
+  rasterize_backward(scene, in, picture.data(), weight.data(), picture_gradient.data(), data_or_null(weight_gradient),
+                     threads, out);
+}
+
+constexpr size_t kHarmonicsChunk = 4096;
+
+void harmonics_forward(In<-1, -1, -1> sh, In<-1, 3> directions, Out<-1, -1> out, int threads) {
+  const size_t count = sh.shape(0), bases = sh.shape(1), channels = sh.shape(2);
+  require(bases == 1 || bases == 4 || bases == 9 || bases == 16, "harmonics have 1, 4, 9 or 16 coefficients");
+  require(directions.shape(0) == count && out.shape(0) == count && out.shape(1) == channels, "shapes do not fit");
+  nb::gil_scoped_release released;
+  const int chunks = static_cast<int>((count + kHarmonicsChunk - 1) / kHarmonicsChunk);
+  parallel_for(chunks, threads, [&](int chunk) {
+    const size_t begin = chunk * kHarmonicsChunk, end = std::min(count, begin + kHarmonicsChunk);
+    kernels().harmonics(sh.data(), directions.data(), static_cast<int>(bases), static_cast<int>(channels), begin, end,
+                        out.data());
+  });
+}
+
+void harmonics_backward(In<-1, -1> gradient, In<-1, 3> directions, Out<-1, -1, -1> out, int threads) {
+  const size_t count = out.shape(0), bases = out.shape(1), channels = out.shape(2);
+  require(bases == 1 || bases == 4 || bases == 9 || bases == 16, "harmonics have 1, 4, 9 or 16 coefficients");
+  require(directions.shape(0) == count && gradient.shape(0) == count && gradient.shape(1) == channels,
+          "shapes do not fit");
+  nb::gil_scoped_release released;
+  const int chunks = static_cast<int>((count + kHarmonicsChunk - 1) / kHarmonicsChunk);
+  parallel_for(chunks, threads, [&](int chunk) {
+    const size_t begin = chunk * kHarmonicsChunk, end = std::min(count, begin + kHarmonicsChunk);
+    kernels().harmonics_backward(gradient.data(), directions.data(), static_cast<int>(bases),
+                                 static_cast<int>(channels), begin, end, out.data());
+  });
+}
+
+double picture_loss(In<-1, -1, -1> picture, In<-1, -1, -1> target, std::optional<In<-1, -1>> weight, float ssim_weight,
+                    std::optional<Out<-1, -1, -1>> gradient, int threads) {
+  const size_t height = picture.shape(0), width = picture.shape(1), channels = picture.shape(2);
+  const auto fits = [&](const auto& array) {
+    return array.shape(0) == height && array.shape(1) == width && array.shape(2) == channels;
+  };
+  require(height > 0 && width > 0 && channels > 0 && fits(target) && (!gradient || fits(*gradient)) &&
+              (!weight || (weight->shape(0) == height && weight->shape(1) == width)),
+          "pictures do not have one shape");
+  nb::gil_scoped_release released;
+  return l1_ssim(picture.data(), target.data(), data_or_null(weight), static_cast<int>(height), static_cast<int>(width),
+                 static_cast<int>(channels), ssim_weight, threads, data_or_null(gradient));
+}
+
+}  // namespace
 
 NB_MODULE(_native, m) {
-  m.doc() = "The native core of rf3dgs.";
-  m.def("info", [] { return nb::dict(); });
+  // Autograd contexts that live until the interpreter ends may still hold a Scene.
+  nb::set_leak_warnings(false);
+  m.doc() = "The native core of rf3dgs: rasterizer, spherical harmonics and picture loss on the CPU.";
+
+  m.def(
+      "info",
+      [] {
+        nb::dict result;
+        result["instruction_set"] = kernels().name;
+        result["threads"] = std::max(1u, std::thread::hardware_concurrency());
+        return result;
+      },
+      "The instruction set in use and the number of hardware threads.");
+  m.def(
+      "constants",
+      [] {
+        nb::dict result;
+        result["ALPHA_MAX"] = kAlphaMax;
+        result["ALPHA_MIN"] = kAlphaMin;
+        result["TRANSMITTANCE_STOP"] = kTransmittanceStop;
+        result["BLUR"] = kBlur;
+        result["NEAR"] = kNear;
+        result["FIELD_CLAMP"] = kFieldClamp;
+        result["SSIM_RADIUS"] = kSsimRadius;
+        result["SSIM_SIGMA"] = kSsimSigma;
+        result["SSIM_C1"] = kSsimC1;
+        result["SSIM_C2"] = kSsimC2;
+        return result;
+      },
+      "The rasterizer's numbers by the names of splats/constants.py.");
+
+  nb::class_<Scene>(m, "Scene", "What the backward pass needs of a forward pass.")
+      .def_prop_ro("visible", [](const Scene& scene) { return scene.splats.size(); })
+      .def_prop_ro("entries", [](const Scene& scene) { return scene.entries.size(); });
+
+  m.def("rasterize", &forward, nb::arg("means").noconvert(), nb::arg("quats").noconvert(),
+        nb::arg("scales").noconvert(), nb::arg("opacities").noconvert(), nb::arg("values").noconvert(),
+        nb::arg("viewmat").noconvert(), nb::arg("camera").noconvert(), nb::arg("background").noconvert().none(),
+        nb::arg("offset").noconvert().none(), nb::arg("picture").noconvert(), nb::arg("weight").noconvert(),
+        nb::arg("radii").noconvert(), nb::arg("threads"));
+  m.def("rasterize_backward", &backward, nb::arg("scene"), nb::arg("means").noconvert(), nb::arg("quats").noconvert(),
+        nb::arg("scales").noconvert(), nb::arg("opacities").noconvert(), nb::arg("values").noconvert(),
+        nb::arg("offset").noconvert().none(), nb::arg("picture").noconvert(), nb::arg("weight").noconvert(),
+        nb::arg("picture_gradient").noconvert(), nb::arg("weight_gradient").noconvert().none(),
+        nb::arg("values_gradient").noconvert().none(), nb::arg("opacities_gradient").noconvert().none(),
+        nb::arg("means_gradient").noconvert().none(), nb::arg("quats_gradient").noconvert().none(),
+        nb::arg("scales_gradient").noconvert().none(), nb::arg("offset_gradient").noconvert().none(),
+        nb::arg("threads"));
+  m.def("harmonics_forward", &harmonics_forward, nb::arg("sh").noconvert(), nb::arg("directions").noconvert(),
+        nb::arg("out").noconvert(), nb::arg("threads"));
+  m.def("harmonics_backward", &harmonics_backward, nb::arg("gradient").noconvert(), nb::arg("directions").noconvert(),
+        nb::arg("out").noconvert(), nb::arg("threads"));
+  m.def("l1_ssim", &picture_loss, nb::arg("picture").noconvert(), nb::arg("target").noconvert(),
+        nb::arg("weight").noconvert().none(), nb::arg("ssim_weight"), nb::arg("gradient").noconvert().none(),
+        nb::arg("threads"));
 }

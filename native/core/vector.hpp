@@ -1,0 +1,92 @@
+// Sixteen floats at a time with the compiler's vector extension: one AVX-512 register, two of AVX2, four of SSE or NEON.
+//
+// Included by the kernel files only, each compiled for one instruction set; everything here has internal linkage so that
+// code of one instruction set is never linked into another.
+#pragma once
+
+#include <cstdint>
+#include <cstring>
+
+#if defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
+namespace {
+
+#define RF_INLINE inline __attribute__((always_inline))
+
+constexpr int kLanes = 16;
+typedef float Vec __attribute__((vector_size(64)));
+typedef int32_t IntVec __attribute__((vector_size(64)));
+
+RF_INLINE Vec splat_vec(float value) { return Vec{} + value; }
+
+RF_INLINE Vec load(const float* from) {
+  Vec result;
+  std::memcpy(&result, from, sizeof(result));
+  return result;
+}
+
+RF_INLINE void store(float* to, Vec value) { std::memcpy(to, &value, sizeof(value)); }
+
+RF_INLINE Vec min_vec(Vec a, Vec b) { return a < b ? a : b; }
+RF_INLINE Vec max_vec(Vec a, Vec b) { return a > b ? a : b; }
+RF_INLINE Vec clamp_vec(Vec value, Vec low, Vec high) { return min_vec(max_vec(value, low), high); }
+
+RF_INLINE Vec sqrt_vec(Vec value) {
+#if defined(__AVX512F__)
+  return (Vec)_mm512_sqrt_ps((__m512)value);
+#else
+  Vec result;
+  for (int lane = 0; lane < kLanes; ++lane) result[lane] = __builtin_sqrtf(value[lane]);
+  return result;
+#endif
+}
+
+// The bits of a comparison's lanes.
+RF_INLINE uint32_t bits_of(IntVec mask) {
+#if defined(__AVX512F__)
+  return _mm512_movepi32_mask((__m512i)mask);
+#elif defined(__AVX2__)
+  __m256 half[2];
+  std::memcpy(half, &mask, sizeof(mask));
+  return static_cast<uint32_t>(_mm256_movemask_ps(half[0])) | (static_cast<uint32_t>(_mm256_movemask_ps(half[1])) << 8);
+#else
+  uint32_t bits = 0;
+  for (int lane = 0; lane < kLanes; ++lane) bits |= (static_cast<uint32_t>(mask[lane]) & 1u) << lane;
+  return bits;
+#endif
+}
+
+// The sum of all lanes, always added in the same order.
+RF_INLINE float sum_of(Vec value) {
+  typedef float Vec8 __attribute__((vector_size(32)));
+  typedef float Vec4 __attribute__((vector_size(16)));
+  Vec8 low, high;
+  std::memcpy(&low, &value, 32);
+  std::memcpy(&high, reinterpret_cast<const char*>(&value) + 32, 32);
+  const Vec8 eight = low + high;
+  Vec4 a, b;
+  std::memcpy(&a, &eight, 16);
+  std::memcpy(&b, reinterpret_cast<const char*>(&eight) + 16, 16);
+  const Vec4 four = a + b;
+  return (four[0] + four[2]) + (four[1] + four[3]);
+}
+
+// e^x for x <= 0 with a relative error near 2e-7; zero below -87.
+RF_INLINE Vec exp_vec(Vec x) {
+  const Vec scaled = max_vec(x, splat_vec(-87.0f)) * 1.44269504088896341f;
+  const Vec magic = splat_vec(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer
+  const Vec shifted = scaled + magic;
+  const Vec fraction = scaled - (shifted - magic);
+  Vec p = splat_vec(1.339887440e-3f);
+  p = p * fraction + 9.618437357e-3f;
+  p = p * fraction + 5.550332548e-2f;
+  p = p * fraction + 2.402264689e-1f;
+  p = p * fraction + 6.931472028e-1f;
+  p = p * fraction + 1.0f;
+  const IntVec exponent = (IntVec)shifted << 23;
+  return (Vec)((IntVec)p + exponent);
+}
+
+}  // namespace

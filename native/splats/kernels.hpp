@@ -1,0 +1,110 @@
+// The inner loops, compiled once for each instruction set and chosen when the module is loaded.
+//
+// A kernel sees raw arrays and knows nothing of threads: `rasterize.cpp` cuts the work and owns the memory.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+namespace rf3dgs {
+
+// A pinhole camera: camera_from_world (row-major rotation, translation), focal lengths and centre in pixels.
+struct View {
+  float rotation[9];
+  float translation[3];
+  float fx, fy, cx, cy;
+  int width, height;
+  float u_low, u_high, v_low, v_high;  // limits of x/z and y/z in the Jacobian
+};
+
+// A Gaussian on the screen: centre, inverse covariance (a, b; b, c), opacity, and the value of d^T conic d where its
+// alpha falls to the cut.
+struct Splat {
+  float x, y, a, b, c, opacity, cut;
+  uint32_t source;  // index among the caller's Gaussians
+};
+
+// What binning needs to know: half the size of the box around a splat [pixel] and its view depth [m].
+struct Extent {
+  float x, y, depth;
+};
+
+// A splat in a tile's list with the bits of those 4x4 pixel blocks it reaches.
+struct Entry {
+  uint32_t splat;
+  uint32_t blocks;
+};
+
+struct Parameters {
+  const float* means;
+  const float* quats;
+  const float* scales;
+  const float* opacities;
+  const float* offset;  // added to the projected centres [pixel]; may be null
+  const float* values;  // [gaussian, channels]; a Gaussian whose values are not finite is not drawn
+  int channels;
+};
+
+// Gradients with respect to one splat on the screen.
+struct SplatGradient {
+  float x, y, a, b, c, opacity;
+};
+
+struct GeometryGradients {
+  float* means;
+  float* quats;
+  float* scales;
+};
+
+// One tile's share of a picture. `values` is [splat, channels] in the order of the splats.
+struct Tile {
+  int x, y;  // first pixel
+  const Entry* entries;
+  size_t count;
+  const Splat* splats;
+  const float* values;
+  int channels;       // of values and pictures
+  int first, chunk;   // the channels this pass blends
+  int width, height;  // of the picture
+  const float* background;  // [channels] or null
+};
+
+struct Kernels {
+  const char* name;
+  // Projects Gaussians [begin, end); returns how many are visible and appends them to splats/extents.
+  size_t (*project)(const View&, const Parameters&, size_t begin, size_t end, Splat*, Extent*, float* radii);
+  // From gradients on the screen of splats [begin, end) to gradients of the parameters.
+  void (*project_backward)(const View&, const Parameters&, const Splat*, const SplatGradient*, size_t begin, size_t end,
+                           const GeometryGradients&);
+  // Which of a tile's 4x4 blocks a splat reaches.
+  uint32_t (*blocks_reached)(const Splat&, float tile_x, float tile_y);
+  void (*blend)(const Tile&, float* picture, float* weight);
+  // Adds to `value_gradients` [entry, chunk] and `splat_gradients` [entry]; geometry only when asked.
+  void (*blend_backward)(const Tile&, const float* picture, const float* weight, const float* picture_gradient,
+                         const float* weight_gradient, bool geometry, float* value_gradients,
+                         SplatGradient* splat_gradients);
+  void (*harmonics)(const float* sh, const float* directions, int bases, int channels, size_t begin, size_t end,
+                    float* out);
+  void (*harmonics_backward)(const float* gradient, const float* directions, int bases, int channels, size_t begin,
+                             size_t end, float* out);
+  // Picture similarity, a row of one channel at a time; `scratch` holds 5 (width + 32) floats.
+  // First blur a, b, aa, bb, ab along the row; then blur these planes along columns, sum weight * SSIM, and write the
+  // weighted partial derivatives with respect to the blurred a, aa and ab; last blur these both ways into the gradient.
+  void (*ssim_row)(const float* a, const float* b, int width, int channels, float* const out[5], float* scratch);
+  double (*ssim_column)(const float* const in[5], int row, int width, int height, const float* weight,
+                        float* const out[3], float* scratch);
+  void (*ssim_gradient_row)(const float* const in[3], int row, int width, int height, const float* a, const float* b,
+                            int channels, const float* weight, float l1_scale, float ssim_scale, float* gradient,
+                            float* scratch);
+};
+
+const Kernels& portable_kernels();
+#if defined(RF3DGS_X86)
+const Kernels& avx2_kernels();
+const Kernels& avx512_kernels();
+#endif
+
+// The widest set this machine can run; RF3DGS_ISA=portable|avx2|avx512 asks for a narrower one.
+const Kernels& kernels();
+
+}  // namespace rf3dgs

@@ -1,0 +1,238 @@
+// Projection of Gaussians to the screen and its derivative, sixteen Gaussians at a time.
+//
+//   p = W mu + t,  u = x/z, v = y/z (clamped),  T = J W with J = [fx/z, 0, -fx u/z; 0, fy/z, -fy v/z],
+//   A = T R S,  Sigma2 = A A^T + blur,  conic = Sigma2^-1.
+//
+// The determinant is blur^2 + blur (|a0|^2 + |a1|^2) + |a0 x a1|^2, which needles cannot cancel.
+#pragma once
+
+#include "core/vector.hpp"
+#include "splats/constants.hpp"
+#include "splats/kernels.hpp"
+
+namespace {
+
+using namespace rf3dgs;
+
+struct Projection {
+  Vec x, y, z;           // in the camera
+  Vec qw, qx, qy, qz;    // unit quaternion
+  Vec inverse_norm;
+  Vec r[9];              // rotation of the quaternion
+  Vec s[3];
+  Vec u, v;
+  IntVec u_free, v_free;  // where the clamp lets gradients through
+  Vec t[6];              // T, two rows
+  Vec a[6];              // A, two rows
+  Vec sxx, sxy, syy, inverse_determinant;
+  Vec screen_x, screen_y;
+  IntVec fine;           // a Gaussian that can be drawn
+};
+
+RF_INLINE Vec gather(const float* from, const size_t* index, int stride, int column) {
+  alignas(64) float lanes[kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) lanes[lane] = from[index[lane] * stride + column];
+  return load(lanes);
+}
+
+RF_INLINE IntVec is_finite(Vec value) { return ((IntVec)value & 0x7f800000) != 0x7f800000; }
+
+RF_INLINE bool all_finite(const float* values, int count) {
+  bool fine = true;
+  for (int at = 0; at < count; ++at) {
+    uint32_t bits;
+    std::memcpy(&bits, values + at, sizeof(bits));
+    fine &= (bits & 0x7f800000u) != 0x7f800000u;
+  }
+  return fine;
+}
+
+RF_INLINE void project_lanes(const View& view, const Parameters& in, const size_t* index, Projection& p) {
+  const float* w = view.rotation;
+  const Vec mx = gather(in.means, index, 3, 0), my = gather(in.means, index, 3, 1), mz = gather(in.means, index, 3, 2);
+  p.x = w[0] * mx + w[1] * my + w[2] * mz + view.translation[0];
+  p.y = w[3] * mx + w[4] * my + w[5] * mz + view.translation[1];
+  p.z = w[6] * mx + w[7] * my + w[8] * mz + view.translation[2];
+  p.fine = (p.z > kNear) & is_finite(p.x) & is_finite(p.y) & is_finite(p.z);
+
+  const Vec qw = gather(in.quats, index, 4, 0), qx = gather(in.quats, index, 4, 1);
+  const Vec qy = gather(in.quats, index, 4, 2), qz = gather(in.quats, index, 4, 3);
+  const Vec norm = sqrt_vec(qw * qw + qx * qx + qy * qy + qz * qz);
+  p.fine &= (norm > kMinQuaternionNorm) & is_finite(norm);
+  p.inverse_norm = 1.0f / norm;
+  p.qw = qw * p.inverse_norm;
+  p.qx = qx * p.inverse_norm;
+  p.qy = qy * p.inverse_norm;
+  p.qz = qz * p.inverse_norm;
+  p.r[0] = 1.0f - 2.0f * (p.qy * p.qy + p.qz * p.qz);
+  p.r[1] = 2.0f * (p.qx * p.qy - p.qw * p.qz);
+  p.r[2] = 2.0f * (p.qx * p.qz + p.qw * p.qy);
+  p.r[3] = 2.0f * (p.qx * p.qy + p.qw * p.qz);
+  p.r[4] = 1.0f - 2.0f * (p.qx * p.qx + p.qz * p.qz);
+  p.r[5] = 2.0f * (p.qy * p.qz - p.qw * p.qx);
+  p.r[6] = 2.0f * (p.qx * p.qz - p.qw * p.qy);
+  p.r[7] = 2.0f * (p.qy * p.qz + p.qw * p.qx);
+  p.r[8] = 1.0f - 2.0f * (p.qx * p.qx + p.qy * p.qy);
+  for (int axis = 0; axis < 3; ++axis) {
+    p.s[axis] = gather(in.scales, index, 3, axis);
+    p.fine &= (p.s[axis] >= 0.0f);
+  }
+
+  const Vec inverse_z = 1.0f / p.z;
+  const Vec u = p.x * inverse_z, v = p.y * inverse_z;
+  p.u_free = (u >= view.u_low) & (u <= view.u_high);
+  p.v_free = (v >= view.v_low) & (v <= view.v_high);
+  p.u = clamp_vec(u, splat_vec(view.u_low), splat_vec(view.u_high));
+  p.v = clamp_vec(v, splat_vec(view.v_low), splat_vec(view.v_high));
+  p.screen_x = view.fx * u + view.cx;
+  p.screen_y = view.fy * v + view.cy;
+  const Vec jx = view.fx * inverse_z, jy = view.fy * inverse_z;
+  for (int col = 0; col < 3; ++col) {
+    p.t[col] = jx * (w[col] - p.u * w[6 + col]);
+    p.t[3 + col] = jy * (w[3 + col] - p.v * w[6 + col]);
+  }
+  for (int row = 0; row < 2; ++row) {
+    for (int col = 0; col < 3; ++col) {
+      const Vec* t = p.t + 3 * row;
+      p.a[3 * row + col] = (t[0] * p.r[col] + t[1] * p.r[3 + col] + t[2] * p.r[6 + col]) * p.s[col];
+    }
+  }
+  const Vec* a = p.a;
+  const Vec first = a[0] * a[0] + a[1] * a[1] + a[2] * a[2];
+  const Vec second = a[3] * a[3] + a[4] * a[4] + a[5] * a[5];
+  const Vec c0 = a[1] * a[5] - a[2] * a[4], c1 = a[2] * a[3] - a[0] * a[5], c2 = a[0] * a[4] - a[1] * a[3];
+  const Vec determinant = kBlur * kBlur + kBlur * (first + second) + (c0 * c0 + c1 * c1 + c2 * c2);
+  p.sxx = first + kBlur;
+  p.syy = second + kBlur;
+  p.sxy = a[0] * a[3] + a[1] * a[4] + a[2] * a[5];
+  p.fine &= is_finite(determinant);
+  p.inverse_determinant = 1.0f / determinant;
+}
+
+size_t project(const View& view, const Parameters& in, size_t begin, size_t end, Splat* splats, Extent* extents,
+               float* radii) {
+  size_t visible = 0;
+  for (size_t start = begin; start < end; start += kLanes) {
+    size_t index[kLanes];
+    const int lanes = static_cast<int>(end - start < kLanes ? end - start : kLanes);
+    for (int lane = 0; lane < kLanes; ++lane) index[lane] = start + (lane < lanes ? lane : 0);
+    Projection p;
+    project_lanes(view, in, index, p);
+    const Vec opacity = gather(in.opacities, index, 1, 0);
+    IntVec fine = p.fine & (opacity >= kAlphaMin) & is_finite(opacity);
+    if (in.offset != nullptr) {
+      p.screen_x += gather(in.offset, index, 2, 0);
+      p.screen_y += gather(in.offset, index, 2, 1);
+    }
+    fine &= is_finite(p.screen_x) & is_finite(p.screen_y);
+    const Vec middle = 0.5f * (p.sxx + p.syy), half = 0.5f * (p.sxx - p.syy);
+    const Vec major = middle + sqrt_vec(half * half + p.sxy * p.sxy);
+    const Vec deviation_x = sqrt_vec(p.sxx), deviation_y = sqrt_vec(p.syy), deviation = sqrt_vec(major);
+    const Vec a = p.syy * p.inverse_determinant, b = -p.sxy * p.inverse_determinant;
+    const Vec c = p.sxx * p.inverse_determinant;
+    fine &= is_finite(a) & is_finite(b) & is_finite(c) & is_finite(major);
+    const uint32_t bits = bits_of(fine);
+    for (int lane = 0; lane < lanes; ++lane) {
+      radii[start + lane] = 0.0f;
+      if (!(bits >> lane & 1u)) continue;
+      const float squared = opacity[lane] > kAlphaMin ? 2.0f * __builtin_logf(opacity[lane] / kAlphaMin) : 0.0f;
+      const float reach = __builtin_sqrtf(squared);
+      const float x = p.screen_x[lane], y = p.screen_y[lane];
+      const float box_x = reach * deviation_x[lane], box_y = reach * deviation_y[lane];
+      const bool in_picture = x + box_x > 0.0f && x - box_x < view.width && y + box_y > 0.0f && y - box_y < view.height;
+      if (!in_picture || !all_finite(in.values + (start + lane) * in.channels, in.channels)) continue;
+      radii[start + lane] = reach * deviation[lane];
+      splats[visible] = {x, y, a[lane], b[lane], c[lane], opacity[lane], squared, static_cast<uint32_t>(start + lane)};
+      extents[visible] = {box_x, box_y, p.z[lane]};
+      ++visible;
+    }
+  }
+  return visible;
+}
+
+void project_backward(const View& view, const Parameters& in, const Splat* splats, const SplatGradient* gradients,
+                      size_t begin, size_t end, const GeometryGradients& out) {
+  const float* w = view.rotation;
+  for (size_t start = begin; start < end; start += kLanes) {
+    const int lanes = static_cast<int>(end - start < kLanes ? end - start : kLanes);
+    size_t index[kLanes];
+    alignas(64) float part[5][kLanes];
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const size_t at = start + (lane < lanes ? lane : 0);
+      index[lane] = splats[at].source;
+      const SplatGradient& g = gradients[at];
+      part[0][lane] = g.x;
+      part[1][lane] = g.y;
+      part[2][lane] = g.a;
+      part[3][lane] = g.b;
+      part[4][lane] = g.c;
+    }
+    Projection p;
+    project_lanes(view, in, index, p);
+    const Vec gx = load(part[0]), gy = load(part[1]), ga = load(part[2]), gb = 0.5f * load(part[3]), gc = load(part[4]);
+
+    // D = -Q G Q, the gradient with respect to Sigma2.
+    const Vec qa = p.syy * p.inverse_determinant, qb = -p.sxy * p.inverse_determinant;
+    const Vec qc = p.sxx * p.inverse_determinant;
+    const Vec h00 = ga * qa + gb * qb, h01 = ga * qb + gb * qc, h10 = gb * qa + gc * qb, h11 = gb * qb + gc * qc;
+    const Vec d00 = -(qa * h00 + qb * h10), d01 = -(qa * h01 + qb * h11), d11 = -(qb * h01 + qc * h11);
+
+    Vec da[6], dt[6];
+    for (int col = 0; col < 3; ++col) {
+      da[col] = 2.0f * (d00 * p.a[col] + d01 * p.a[3 + col]);
+      da[3 + col] = 2.0f * (d01 * p.a[col] + d11 * p.a[3 + col]);
+    }
+    Vec dr[9], ds[3];
+    for (int row = 0; row < 3; ++row) {
+      dt[row] = dt[3 + row] = Vec{};
+      for (int col = 0; col < 3; ++col) {
+        const Vec m = p.r[3 * row + col] * p.s[col];
+        dt[row] += da[col] * m;
+        dt[3 + row] += da[3 + col] * m;
+        dr[3 * row + col] = p.t[row] * da[col] + p.t[3 + row] * da[3 + col];
+      }
+    }
+    for (int col = 0; col < 3; ++col) {
+      ds[col] = dr[col] * p.r[col] + dr[3 + col] * p.r[3 + col] + dr[6 + col] * p.r[6 + col];
+      for (int row = 0; row < 3; ++row) dr[3 * row + col] *= p.s[col];
+    }
+    Vec dw = 2.0f * (-p.qz * dr[1] + p.qy * dr[2] + p.qz * dr[3] - p.qx * dr[5] - p.qy * dr[6] + p.qx * dr[7]);
+    Vec dx = 2.0f * (p.qy * dr[1] + p.qz * dr[2] + p.qy * dr[3] - 2.0f * p.qx * dr[4] - p.qw * dr[5] + p.qz * dr[6] +
+                     p.qw * dr[7] - 2.0f * p.qx * dr[8]);
+    Vec dy = 2.0f * (-2.0f * p.qy * dr[0] + p.qx * dr[1] + p.qw * dr[2] + p.qx * dr[3] + p.qz * dr[5] - p.qw * dr[6] +
+                     p.qz * dr[7] - 2.0f * p.qy * dr[8]);
+    Vec dz = 2.0f * (-2.0f * p.qz * dr[0] - p.qw * dr[1] + p.qx * dr[2] + p.qw * dr[3] - 2.0f * p.qz * dr[4] +
+                     p.qy * dr[5] + p.qx * dr[6] + p.qy * dr[7]);
+    const Vec along = dw * p.qw + dx * p.qx + dy * p.qy + dz * p.qz;
+    dw = (dw - p.qw * along) * p.inverse_norm;
+    dx = (dx - p.qx * along) * p.inverse_norm;
+    dy = (dy - p.qy * along) * p.inverse_norm;
+    dz = (dz - p.qz * along) * p.inverse_norm;
+
+    const Vec inverse_z = 1.0f / p.z;
+    const Vec jx = view.fx * inverse_z, jy = view.fy * inverse_z;
+    const Vec j00 = w[0] * dt[0] + w[1] * dt[1] + w[2] * dt[2], j02 = w[6] * dt[0] + w[7] * dt[1] + w[8] * dt[2];
+    const Vec j11 = w[3] * dt[3] + w[4] * dt[4] + w[5] * dt[5], j12 = w[6] * dt[3] + w[7] * dt[4] + w[8] * dt[5];
+    const Vec none = Vec{};
+    const Vec du = p.u_free ? -jx * j02 : none, dv = p.v_free ? -jy * j12 : none;
+    const Vec px = inverse_z * du + jx * gx;
+    const Vec py = inverse_z * dv + jy * gy;
+    const Vec pz = inverse_z * (-jx * j00 - jy * j11 + jx * p.u * j02 + jy * p.v * j12) -
+                   inverse_z * inverse_z * (p.x * du + p.y * dv) -
+                   inverse_z * inverse_z * (view.fx * p.x * gx + view.fy * p.y * gy);
+    for (int lane = 0; lane < lanes; ++lane) {
+      float* means = out.means + 3 * index[lane];
+      for (int col = 0; col < 3; ++col) {
+        means[col] = w[col] * px[lane] + w[3 + col] * py[lane] + w[6 + col] * pz[lane];
+        out.scales[3 * index[lane] + col] = ds[col][lane];
+      }
+      float* quats = out.quats + 4 * index[lane];
+      quats[0] = dw[lane];
+      quats[1] = dx[lane];
+      quats[2] = dy[lane];
+      quats[3] = dz[lane];
+    }
+  }
+}
+
+}  // namespace

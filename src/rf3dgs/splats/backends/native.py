@@ -1,0 +1,152 @@
+"""The native core behind torch: rasterizer, harmonics and picture loss as autograd functions.
+
+The core sees detached, contiguous float32 arrays on the CPU and computes only the gradients that are asked for. Second
+derivatives are not available.
+"""
+
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from rf3dgs.core.errors import MissingDependencyError
+from rf3dgs.core.grids import Camera
+from rf3dgs.splats.backends.core import native_core, native_failure, thread_count
+from rf3dgs.splats.raster import Raster
+
+
+def core() -> ModuleType:
+    """The compiled module; raises MissingDependencyError where it cannot be loaded."""
+    module = native_core()
+    if module is None:
+        raise MissingDependencyError(
+            f"the native core cannot be loaded ({native_failure()}); install rf3dgs from a wheel, or with a C++20 "
+            'compiler and CMake, or use backend="reference"'
+        )
+    return module
+
+
+def takes(*tensors: Tensor | None) -> bool:
+    """True when the core is there and all tensors are float32 on the CPU."""
+    fits = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors if tensor is not None)
+    return fits and native_core() is not None
+
+
+def _plain(tensor: Tensor) -> Tensor:
+    return tensor.detach().contiguous()
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        values: Tensor,
+        background: Tensor | None,
+        offset: Tensor | None,
+        camera: Camera,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        inputs = [None if tensor is None else _plain(tensor) for tensor in (means, quats, scales, opacities, values)]
+        fill = None if background is None else _plain(background)
+        shift = None if offset is None else _plain(offset)
+        picture = torch.empty(camera.height, camera.width, values.shape[1])
+        weight = torch.empty(camera.height, camera.width)
+        radii = torch.empty(len(means))
+        viewmat, K = (_plain(matrix).float() for matrix in (camera.viewmat, camera.K))
+        scene = core().rasterize(*inputs, viewmat, K, fill, shift, picture, weight, radii, thread_count())
+        ctx.scene = scene
+        ctx.save_for_backward(*inputs, shift, picture, weight)
+        ctx.mark_non_differentiable(radii)
+        ctx.set_materialize_grads(False)
+        return picture, weight, radii
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        of_picture, of_weight, _ = gradients
+        *inputs, shift, picture, weight = ctx.saved_tensors
+        if of_picture is None and of_weight is None:
+            return (None,) * 8
+        of_picture = torch.zeros_like(picture) if of_picture is None else _plain(of_picture)
+        of_weight = None if of_weight is None else _plain(of_weight)
+        needs = ctx.needs_input_grad
+        geometry = any(needs[:3])
+        means, quats, scales, opacities, values = inputs
+        to_means, to_quats, to_scales = (torch.zeros_like(t) if geometry else None for t in (means, quats, scales))
+        to_opacities = torch.zeros_like(opacities) if needs[3] else None
+        to_values = torch.zeros_like(values) if needs[4] else None
+        to_offset = torch.zeros_like(shift) if needs[6] else None
+        outputs = (to_values, to_opacities, to_means, to_quats, to_scales, to_offset)
+        core().rasterize_backward(
+            ctx.scene, *inputs, shift, picture, weight, of_picture, of_weight, *outputs, thread_count()
+        )
+        to_background = None
+        if needs[5]:
+            to_background = torch.einsum("hwc,hw->c", of_picture, 1 - weight)
+        result = (to_means, to_quats, to_scales, to_opacities, to_values, to_background, to_offset)
+        return (*(gradient if need else None for gradient, need in zip(result, needs, strict=False)), None)
+
+
+def rasterize_native(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    values: Tensor,
+    camera: Camera,
+    *,
+    background: Tensor | None = None,
+    screen_offset: Tensor | None = None,
+) -> Raster:
+    """`rasterize` by the native core; see there."""
+    arguments = (means, quats, scales, opacities, values, background, screen_offset, camera)
+    return Raster(*_Rasterize.apply(*arguments))  # type: ignore[misc]
+
+
+class _Harmonics(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, sh: Tensor, directions: Tensor) -> Tensor:
+        directions = _plain(directions)
+        values = torch.empty(sh.shape[0], sh.shape[2])
+        core().harmonics_forward(_plain(sh), directions, values, thread_count())
+        ctx.save_for_backward(directions)
+        ctx.shape = sh.shape
+        return values
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, None]:
+        (directions,) = ctx.saved_tensors
+        result = torch.empty(ctx.shape)
+        core().harmonics_backward(_plain(gradients[0]), directions, result, thread_count())
+        return result, None
+
+
+def evaluate_harmonics(sh: Tensor, directions: Tensor) -> Tensor:
+    """`sum_k sh_k Y_k(d)` `[gaussian, channel]` of `[gaussian, k, channel]`; differentiable in `sh` only."""
+    return _Harmonics.apply(sh, directions)  # type: ignore[return-value]
+
+
+class _L1Ssim(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, picture: Tensor, target: Tensor, weight: Tensor | None, ssim_weight: float) -> Tensor:
+        gradient = torch.empty_like(picture, memory_format=torch.contiguous_format) if picture.requires_grad else None
+        share = None if weight is None else _plain(weight)
+        loss = core().l1_ssim(_plain(picture), _plain(target), share, ssim_weight, gradient, thread_count())
+        ctx.gradient = gradient
+        return torch.tensor(loss, dtype=torch.float32)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, None, None, None]:
+        return ctx.gradient * gradients[0], None, None, None
+
+
+def l1_ssim_native(picture: Tensor, target: Tensor, ssim_weight: float, weight: Tensor | None) -> Tensor:
+    """`image_loss.l1_ssim` by the native core; differentiable in `picture` only."""
+    return _L1Ssim.apply(picture, target, weight, ssim_weight)  # type: ignore[return-value]
