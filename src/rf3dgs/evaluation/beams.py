@@ -6,6 +6,8 @@ grid that is not the whole sphere has the forward panel only. The true covarianc
 """
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -68,8 +70,9 @@ def beam_loss_eigen(truth: Tensor, prediction: Tensor) -> Tensor:
     loss in dB is averaged over the panels whose true covariance is not zero. A prediction of zero counts as an
     arbitrary beam, which collects the mean eigenvalue.
     """
-    best = torch.linalg.eigvalsh(truth)[..., -1]
-    value, vector = torch.linalg.eigh(prediction)
+    with _one_thread():
+        best = torch.linalg.eigvalsh(truth)[..., -1]
+        value, vector = torch.linalg.eigh(prediction)
     beam = vector[..., -1]
     collected = (beam.conj()[..., None, :] @ truth @ beam[..., :, None])[..., 0, 0].real
     blind = truth.diagonal(dim1=-2, dim2=-1).real.mean(-1)
@@ -103,3 +106,14 @@ def _steered_power(truth: Spectrum, aimed: Spectrum, covariance: Tensor, array: 
     beam = manifold(array, local).to(torch.complex128)
     beam = beam / torch.linalg.vector_norm(beam, dim=-1, keepdim=True).clamp_min(1e-30)
     return (beam.conj()[..., None, :] @ covariance @ beam[..., :, None])[..., 0, 0].real
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """One thread for many small eigenproblems: several wait for each other, the longer the busier the machine is."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -91,7 +91,7 @@ def position_map(
         errors = [evaluation.column(FIELD, "rmse_db") for evaluation in evaluations.values()]
         if errors:
             every = np.concatenate(errors)
-            scale = Normalize(np.floor(np.nanmin(every)), np.ceil(np.nanmax(every) + 1e-9))
+            scale = Normalize(np.nanmin(every) - 0.05, np.nanmax(every) + 0.05)
             colours = LinearSegmentedColormap.from_list("level", LEVEL_COLOURS / 255.0)
             markers = dict(zip(evaluations, ("o", "s", "D", "^", "P"), strict=False))
             for (name, evaluation), error in zip(evaluations.items(), errors, strict=True):

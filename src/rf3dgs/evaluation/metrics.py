@@ -35,7 +35,7 @@ def window_level(power: Tensor, window: DbWindow) -> Tensor:
 
 def window_picture(power: Tensor, window: DbWindow) -> Tensor:
     """The window's picture in [0, 1] of linear power, same shape: `clip((dB - floor) / (ceil - floor), 0, 1)`."""
-    return (window_level(power, window) - window.floor_db) / (window.ceil_db - window.floor_db)
+    return window.encode(power)
 
 
 def psnr(truth: Tensor, prediction: Tensor, weight: Tensor) -> Tensor:

@@ -45,6 +45,7 @@ figure > img, figure > svg { width:100%; height:auto; display:block; }
 figcaption { font-size:.9rem; margin:2px 0 4px; }
 img { max-width:100%; height:auto; display:block; }
 .wide img { margin:0 auto; }
+.map img { max-width:min(100%,800px); }
 svg image { image-rendering:pixelated; }
 svg text { font:12.5px system-ui,-apple-system,"Segoe UI",Roboto,Arial,sans-serif; fill:#3a414a; }
 svg .frame { fill:none; stroke:#5d6570; stroke-width:1; }
@@ -53,6 +54,7 @@ svg .mark { fill:none; stroke:#fff; stroke-width:1.8; }
 svg .mark-under { fill:none; stroke:#111; stroke-width:4; }
 svg.bar { width:100%; max-width:460px; height:auto; display:block; }
 .bars { display:flex; flex-wrap:wrap; gap:4px 24px; margin:8px 0 0; }
+.scales { display:flex; flex-direction:column; justify-content:center; gap:18px; }
 .bars > * { flex:1 1 260px; }
 .time { display:block; height:9px; background:var(--accent); border-radius:2px; min-width:2px; }
 pre { background:var(--wash); border:1px solid var(--line); border-radius:6px; padding:10px 12px; overflow-x:auto;
@@ -60,7 +62,8 @@ pre { background:var(--wash); border:1px solid var(--line); border-radius:6px; p
 details { margin-top:14px; } summary { cursor:pointer; color:var(--accent); }
 details dt { font-weight:600; margin-top:6px; } details dd { margin:0; color:var(--soft); }
 @media (max-width:600px) { main { padding:12px 10px 40px; } section { padding:14px 13px; border-radius:8px; }
-  header h1 { font-size:1.5rem; } th, td { padding:5px 6px; } th:first-child, td:first-child { min-width:8.5em; } }
+  header h1 { font-size:1.5rem; } th, td { padding:5px 6px; } th:first-child, td:first-child { min-width:7.5em; }
+  .word { display:none; } }
 @media print { body { background:#fff; font-size:10.5pt; } main { max-width:none; padding:0; }
   section { border:0; padding:0; margin:0 0 18px; } figure, tr { break-inside:avoid; } h2, h3 { break-after:avoid; }
   .scroll { overflow:visible; } td.best, .time { print-color-adjust:exact; -webkit-print-color-adjust:exact; }

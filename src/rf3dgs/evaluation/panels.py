@@ -13,7 +13,7 @@ from rf3dgs.core.grids import DirectionGrid
 from rf3dgs.evaluation.pictures import encoded
 
 Ticks = list[tuple[float, str]]
-_LEFT, _RIGHT, _TOP, _BOTTOM, _PLOT = 46, 14, 6, 38, 400
+_LEFT, _RIGHT, _TOP, _BOTTOM, _PLOT = 46, 22, 6, 38, 400
 
 
 def data_address(content: bytes, kind: str = "png") -> str:

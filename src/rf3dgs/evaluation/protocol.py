@@ -17,7 +17,7 @@ from rf3dgs.evaluation.baselines.lookup import InverseDistance, NearestNeighbour
 from rf3dgs.evaluation.lpips import Lpips
 from rf3dgs.evaluation.table import CEILING, FIELD, Evaluation
 from rf3dgs.spectra.codec import DbWindow, window_of
-from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
 
 LEAK_DISTANCE = 1e-3  # [m]
 
@@ -73,7 +73,7 @@ def evaluate(
         for index in range(len(spectra)):
             predicted.append(_checked(method.render(spectra.pose[index], spectra.grid), spectra[index], name))
             progress.update(number * len(spectra) + index + 1)
-        values[name] = score(spectra, stack(predicted), truth_covariance, window, array, lpips)
+        values[name] = score(spectra, stack_spectra(predicted), truth_covariance, window, array, lpips)
     if repeat is not None:
         values[CEILING] = _ceiling(spectra, _with_axis(repeat), truth_covariance, window, array, lpips)
     progress.finish()
@@ -126,26 +126,8 @@ def refuse_leak(train: Tensor, test: Tensor) -> None:
         )
 
 
-def stack(spectra: list[Spectrum]) -> Spectrum:
-    """One spectrum `[n, row, col]` of n single ones on one grid."""
-    first = spectra[0]
-    pose = Pose(
-        torch.stack([spectrum.pose.position for spectrum in spectra]),
-        torch.stack([spectrum.pose.orientation for spectrum in spectra]),
-    )
-    delay = [spectrum.delay for spectrum in spectra if spectrum.delay is not None]
-    aod = [spectrum.aod for spectrum in spectra if spectrum.aod is not None]
-    return Spectrum(
-        torch.stack([spectrum.power for spectrum in spectra]),
-        *(first.grid, pose, first.frequency, first.instrument, first.method),
-        torch.stack(delay) if len(delay) == len(spectra) else None,
-        torch.stack(aod) if len(aod) == len(spectra) else None,
-        first.tx,
-    )
-
-
 def _with_axis(spectra: Spectrum) -> Spectrum:
-    return spectra if spectra.pose.batch_shape else stack([spectra])
+    return spectra if spectra.pose.batch_shape else stack_spectra([spectra])
 
 
 def _check_truth(spectra: Spectrum) -> None:

@@ -134,7 +134,11 @@ def _tables(evaluations: Mapping[str, Evaluation]) -> list[str]:
         rows = []
         for score in SCORES:
             unit = f' <span class="unit">[{score.unit}]</span>' if score.unit else ""
-            arrow = "\N{DOWNWARDS ARROW} lower" if score.better == "lower" else "\N{UPWARDS ARROW} higher"
+            arrow = (
+                '\N{DOWNWARDS ARROW}<span class="word"> lower</span>'
+                if score.better == "lower"
+                else '\N{UPWARDS ARROW}<span class="word"> higher</span>'
+            )
             best = evaluation.best(score.key)
             cells = "".join(_cell(evaluation, method, score, method in best) for method in evaluation.methods)
             rows.append(f'<tr><th>{score.label}{unit}</th><td class="unit">{arrow}</td>{cells}</tr>')
@@ -189,6 +193,7 @@ def _spectra(inputs: ReportInputs) -> list[str]:
     window = inputs.window
     if window is None or not inputs.examples:
         return []
+    scales = _scales(window)
     parts = [
         page.note(
             "Looking out of the receiver: up is up, left is left. The ring marks the strongest direction. All levels "
@@ -206,11 +211,16 @@ def _spectra(inputs: ReportInputs) -> list[str]:
             if view is not None:
                 picture = difference_picture(example.truth, view, window, span_db=SPAN_DB)
                 shown.append(page.figure(panel(picture, view.grid, f"error of the {name}"), f"Error of the {name}"))
+        shown.append(scales)
         parts.append(f'<h3>{escape(example.label)}</h3><div class="grid">{"".join(shown)}</div>')
+    return parts
+
+
+def _scales(window: DbWindow) -> str:
     ramp = np.linspace(0, 1, 256)
     level = colour_bar(coloured(ramp), even_ticks(window.floor_db, window.ceil_db), "power [dB]")
     gap = colour_bar(coloured(ramp, DIFFERENCE_COLOURS), even_ticks(-SPAN_DB, SPAN_DB, count=4), "error [dB]")
-    return [*parts, f'<div class="bars">{level}{gap}</div>']
+    return f'<div class="scales">{level}{gap}</div>'
 
 
 def _strongest(spectrum: Spectrum) -> tuple[float, float]:
@@ -243,10 +253,14 @@ def _channel_state(inputs: ReportInputs) -> list[str]:
     ramp = np.linspace(0, 1, 256)
     bars = (
         colour_bar(coloured(ramp), even_ticks(0, 1e9 * longest), "delay [ns]"),
-        colour_bar(hues(ramp - 0.5), even_ticks(-180, 180, count=4), "departure azimuth [deg], world"),
-        colour_bar(coloured(ramp), even_ticks(0, 180, count=4), "departure zenith [deg]"),
+        colour_bar(hues(ramp - 0.5), _evenly(-180, 180), "departure azimuth [deg], world"),
+        colour_bar(coloured(ramp), _evenly(0, 180), "departure zenith [deg]"),
     )
     return [*parts, f'<div class="bars">{"".join(bars)}</div>']
+
+
+def _evenly(low: int, high: int) -> list[tuple[float, str]]:
+    return [(quarter / 4, f"{low + (high - low) * quarter / 4:g}") for quarter in range(5)]
 
 
 def _panel_of(picture: np.ndarray, view: Spectrum, caption: str) -> str:
@@ -268,7 +282,7 @@ def _map(inputs: ReportInputs) -> list[str]:
     picture = position_map(
         *(np.asarray(inputs.positions), inputs.roles, dict(inputs.evaluations)), tx=tx, footprint=inputs.footprint
     )
-    return [f'<div class="wide">{page.image(data_address(picture), "map of the positions")}</div>']
+    return [f'<div class="wide map">{page.image(data_address(picture), "map of the positions")}</div>']
 
 
 def _timings(timings: Mapping[str, float]) -> list[str]:

@@ -33,13 +33,15 @@ class Score:
     def of(self, values: np.ndarray) -> float:
         """The statistic of per-position values, ignoring NaN; NaN when nothing is left."""
         values = values[~np.isnan(values)]
-        if not len(values):
-            return math.nan
+        return float(self.over(values)) if len(values) else math.nan
+
+    def over(self, values: np.ndarray) -> np.ndarray:
+        """The statistic `[*batch]` over the last axis of `[*batch, n]`, which has no NaN."""
         if self.statistic == "median":
-            return float(np.median(values))
+            return np.median(values, -1)
         if self.statistic == "p90":
-            return float(np.percentile(values, 90))
-        return float(100.0 * np.mean(values <= 1.0)) if self.statistic == "within_1" else float(np.mean(values))
+            return np.percentile(values, 90, -1)
+        return 100.0 * np.mean(values <= 1.0, -1) if self.statistic == "within_1" else np.mean(values, -1)
 
     def text(self, value: float) -> str:
         """The number as shown, or "n/a"."""

@@ -82,10 +82,9 @@ class Evaluation:
         """The methods that the field must beat."""
         return tuple(name for name in self.values if name not in (FIELD, CEILING))
 
-    @cached_property
-    def _resample(self) -> np.ndarray:
-        """Indices `[resample, n]`, the same for all methods, so that differences are paired."""
-        return np.random.default_rng(self.seed).integers(0, len(self), (RESAMPLES, len(self)))
+    def _resamples(self, count: int) -> np.ndarray:
+        """Indices `[resample, count]` of a bootstrap, the same for all methods, so that differences are paired."""
+        return np.random.default_rng((self.seed, count)).integers(0, count, (RESAMPLES, count))
 
     def column(self, method: str, column: str) -> np.ndarray:
         """The per-position values `[n]` of one method."""
@@ -102,12 +101,12 @@ class Evaluation:
         """One number with its 95 % bootstrap interval; the interval is NaN with fewer than two positions."""
         score = SCORE[key]
         values = self.column(method, score.column)
-        point = score.of(values)
-        if math.isnan(point) or (~np.isnan(values)).sum() < 2:
-            return Estimate(point, math.nan, math.nan)
-        draws = np.array([score.of(values[index]) for index in self._resample])
-        low, high = np.nanpercentile(draws, (2.5, 97.5))
-        return Estimate(point, float(low), float(high))
+        values = values[~np.isnan(values)]
+        if len(values) < 2:
+            return Estimate(score.of(values), math.nan, math.nan)
+        draws = score.over(values[self._resamples(len(values))])
+        low, high = np.percentile(draws, (2.5, 97.5))
+        return Estimate(score.of(values), float(low), float(high))
 
     def best(self, key: str) -> tuple[str, ...]:
         """The methods with the best number as shown, the ceiling left out; none when fewer than two have one."""
@@ -131,13 +130,13 @@ class Evaluation:
 
     def _compare(self, score: Score, baseline: str) -> Comparison | None:
         field, other = self.column(FIELD, score.column), self.column(baseline, score.column)
-        values = score.of(field), score.of(other)
-        if math.isnan(values[0]) or math.isnan(values[1]):
+        both = ~np.isnan(field) & ~np.isnan(other)
+        if not both.any():
             return None
-        gaps = np.array([score.of(field[index]) - score.of(other[index]) for index in self._resample])
-        gaps = gaps[~np.isnan(gaps)]
-        low, high = np.percentile(gaps, (2.5, 97.5)) if len(gaps) else (0.0, 0.0)
-        return Comparison(score, baseline, *values, clear=bool(len(self) > 1 and (low > 0 or high < 0)))
+        index = self._resamples(int(both.sum()))
+        low, high = np.percentile(score.over(field[both][index]) - score.over(other[both][index]), (2.5, 97.5))
+        clear = bool(both.sum() > 1 and (low > 0 or high < 0))
+        return Comparison(score, baseline, score.of(field), score.of(other), clear)
 
     @property
     def wins(self) -> tuple[Comparison, ...]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, sample_grid
-from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
 
 SAME_PLACE = 1e-3  # [m], views closer than this belong to one position
 
@@ -36,14 +36,12 @@ class InverseDistance:
     def render(self, pose: Pose, grid: DirectionGrid) -> Spectrum:
         """The copied spectrum on `grid` at one pose, or `[n, row, col]` at n poses."""
         if not pose.batch_shape:
-            return self._assemble(self._at(pose, grid), pose, grid, batch=())
-        parts = [self._at(pose[index], grid) for index in range(len(pose))]
-        stacked = tuple(None if parts[0][k] is None else torch.stack([part[k] for part in parts]) for k in range(3))
-        return self._assemble(stacked, pose, grid, batch=(len(pose),))
+            return self._one(pose, grid)
+        return stack_spectra([self._one(pose[index], grid) for index in range(len(pose))])
 
-    def _assemble(self, values, pose: Pose, grid: DirectionGrid, *, batch: tuple[int, ...]) -> Spectrum:
-        train, (power, delay, aod) = self.train, values
-        power = power.reshape(*batch, *grid.shape)
+    def _one(self, pose: Pose, grid: DirectionGrid) -> Spectrum:
+        power, delay, aod = self._at(pose, grid)
+        train = self.train
         return Spectrum(power, grid, pose, train.frequency, train.instrument, self.name, delay, aod, train.tx)
 
     def _at(self, pose: Pose, grid: DirectionGrid) -> tuple[Tensor, Tensor | None, Tensor | None]:
