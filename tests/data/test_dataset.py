@@ -294,7 +294,5 @@ def test_unsound_spectra_are_not_written(spectra, tmp_path):
 
 
 def test_a_folder_without_a_manifest_is_no_dataset(tmp_path):
-    with pytest.raises(
-        DataError, match=r"expected dataset\.json in it; this is no dataset, or saving it was interrupted"
-    ):
+    with pytest.raises(DataError, match=r"expected dataset\.json in it; this is no dataset, or saving .* interrupted"):
         Dataset.load(tmp_path)

@@ -239,7 +239,7 @@ def test_blender_files_are_read_with_their_roles(photos, tmp_path):
         torch.testing.assert_close(new.camera.viewmat, old.camera.viewmat, atol=1e-5, rtol=1e-5)
         torch.testing.assert_close(new.camera.K, old.camera.K)
         assert torch.equal(new.load(), old.load())
-    with pytest.raises(DataError, match="expected transforms_train.json"):
+    with pytest.raises(DataError, match=r"expected transforms_train\.json"):
         read_blender(tmp_path)
 
 
@@ -281,9 +281,7 @@ def test_rf3dgs_v0_pictures_become_spectra_through_the_users_window(photos, tmp_
 
 def test_rf3dgs_v0_without_units_says_what_to_supply(photos, tmp_path):
     site, _ = _v0_site(photos, tmp_path)
-    with pytest.raises(
-        InputError, match=r"carry no units: give window=DbWindow\(floor_db, ceil_db\), frequency in hertz"
-    ):
+    with pytest.raises(InputError, match=r"carry no units: give window=DbWindow\(floor_db, ceil_db\), freq"):
         read_rf3dgs_v0(site)
     found = read_photos(site)
     assert found.layout == "rf3dgs_v0"
@@ -300,7 +298,7 @@ def test_rf3dgs_v0_without_units_says_what_to_supply(photos, tmp_path):
 def test_read_photos_says_which_layout_it_found(photos, saved, tmp_path):
     assert read_photos(saved).layout == "native"
     assert read_photos(saved / "photos").layout == "nerfstudio"
-    assert read_photos(_colmap_site(photos, tmp_path)).layout == "colmap"
+    assert read_photos(_colmap_site(photos, tmp_path / "colmap")).layout == "colmap"
     _blender_site(photos, tmp_path / "blender")
     assert read_photos(tmp_path / "blender").layout == "blender"
     (tmp_path / "empty").mkdir()

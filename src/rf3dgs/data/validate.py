@@ -188,8 +188,8 @@ def _caught(file: Path, work: Callable[[], object], remedy: str) -> Iterator[Fau
 
 def _fault(file: Path, error: Exception, remedy: str) -> Fault:
     """A fault out of an error's message; a file that the message begins with is taken as the one at fault."""
-    message = str(error)
+    message = str(error).rstrip(".").removesuffix(remedy).rstrip(" .;")
     head, colon, rest = message.partition(": ")
     if colon and len(head) < 4096 and Path(head).exists():
-        return Fault(Path(head), rest.rstrip("."), remedy)
-    return Fault(file, message.rstrip("."), remedy)
+        return Fault(Path(head), rest, remedy)
+    return Fault(file, message, remedy)
