@@ -30,10 +30,10 @@ def bin_diffuse(paths: Paths, *, cell: float = math.radians(1.0), delay_step: fl
         raise InputError("bin_diffuse needs paths.kind to tell diffuse paths from mirrors; give the interactions")
     if paths.coeff.dim() == 1:
         return _bin_one(paths, cell, delay_step)
-    flat = paths._map(lambda value: value.reshape(-1, value.shape[-1]), rx=_flat(paths.rx))
+    flat = paths.flat()
     merged = stack_paths([_bin_one(flat[index], cell, delay_step) for index in range(len(flat.rx))])
-    batch = paths.coeff.shape[:-1]
-    return merged._map(lambda value: value.reshape(*batch, value.shape[-1]), rx=paths.rx)
+    shape = (*paths.coeff.shape[:-1], merged.coeff.shape[-1])
+    return merged._map(lambda value: value.reshape(shape), rx=paths.rx)
 
 
 def stack_paths(rows: list[Paths]) -> Paths:
@@ -50,10 +50,6 @@ def stack_paths(rows: list[Paths]) -> Paths:
 
 def _padded(value: Tensor, length: int) -> Tensor:
     return torch.nn.functional.pad(value, (0, length - value.shape[-1]))
-
-
-def _flat(pose: Pose) -> Pose:
-    return Pose(pose.position.reshape(-1, 3), pose.orientation.reshape(-1, 4))
 
 
 def _bin_one(paths: Paths, cell: float, delay_step: float) -> Paths:

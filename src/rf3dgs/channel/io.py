@@ -152,14 +152,8 @@ def _columns(paths: Paths) -> dict[str, np.ndarray]:
 
 def save_paths(paths: Paths, path: str | Path, *, meta: Mapping[str, object] | None = None) -> None:
     """Write paths `[*batch, path]` to an HDF5 file; batches of several axes become one list of receivers."""
-    length = paths.coeff.shape[-1]
-    flat = paths._map(lambda value: value.reshape(-1, length), rx=_flat(paths.rx))
     with PathsWriter(path, paths.frequency, paths.tx, meta) as writer:
-        writer.append(flat)
-
-
-def _flat(pose: Pose) -> Pose:
-    return Pose(pose.position.reshape(-1, 3), pose.orientation.reshape(-1, 4))
+        writer.append(paths.flat())
 
 
 def load_paths(path: str | Path) -> Paths:

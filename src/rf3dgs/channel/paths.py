@@ -1,5 +1,6 @@
 """`Paths`: the propagation paths between one transmitter and any number of receivers."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -109,6 +110,12 @@ class Paths:
         if self.coeff.dim() < 2:
             raise InputError("these are the paths of one receiver; there is no receiver axis to index")
         return self._map(lambda value: value[index], rx=self.rx[index])
+
+    def flat(self) -> "Paths":
+        """The same paths with one receiver axis `[rx, path]`, however many batch axes there are."""
+        shape = (math.prod(self.coeff.shape[:-1]), self.coeff.shape[-1])
+        rx = Pose(self.rx.position.reshape(-1, 3), self.rx.orientation.reshape(-1, 4))
+        return self._map(lambda value: value.reshape(shape), rx=rx)
 
     def strongest(self, count: int) -> "Paths":
         """The `count` strongest paths of each receiver, strongest first."""

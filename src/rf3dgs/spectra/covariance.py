@@ -40,9 +40,9 @@ def covariance_of(
     """
     if snapshots is not None and snapshots < 1:
         raise InputError(f"snapshots must be at least 1, or None for uncorrelated paths; got {snapshots}")
-    batch, length = paths.coeff.shape[:-1], paths.coeff.shape[-1]
+    batch = paths.coeff.shape[:-1]
     pose = pose_for(paths, pose)
-    rows = paths._map(lambda value: value.reshape(-1, length), rx=_flat(paths.rx))
+    rows = paths.flat()
     world_from_device = pose.world_from_device.reshape(-1, 3, 3)
     generator = torch.Generator().manual_seed(seed)
     result = []
@@ -73,10 +73,6 @@ def covariance_of_spectrum(spectrum: Spectrum, array: PlanarArray) -> Tensor:
     batch = spectrum.power.shape[:-2]
     rows = [(steering.mT * row) @ steering.conj() for row in weight.reshape(-1, len(directions))]
     return torch.stack(rows).reshape(*batch, array.count, array.count)
-
-
-def _flat(pose: Pose) -> Pose:
-    return Pose(pose.position.reshape(-1, 3), pose.orientation.reshape(-1, 4))
 
 
 def _merged(paths: Paths, delay_step: float) -> Paths:

@@ -1,6 +1,7 @@
 """`spectrum_of`: from paths to what an instrument sees."""
 
 import math
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -60,14 +61,13 @@ def spectrum_of(
     if lobe is not None:
         raise InputError(f'lobe belongs to method "ideal"; the lobe of {name!r} is that of its array')
     pose = pose_for(paths, pose)
-    batch, length = paths.coeff.shape[:-1], paths.coeff.shape[-1]
-    rx = Pose(pose.position.reshape(-1, 3), pose.orientation.reshape(-1, 4))
-    rows = paths._map(lambda value: value.reshape(-1, length), rx=rx)
+    batch = paths.coeff.shape[:-1]
+    rows = replace(paths, rx=pose).flat()
     steering = manifold(array, grid.directions.double())
-    power = torch.empty(len(rx), *grid.shape)
+    power = torch.empty(len(rows.rx), *grid.shape)
     reporter = Silent() if progress is None else progress
-    reporter.start(f"{name} spectra", len(rx))
-    for index in range(len(rx)):
+    reporter.start(f"{name} spectra", len(rows.rx))
+    for index in range(len(rows.rx)):
         R = covariance_of(
             rows[index], array, snapshots=snapshots, bandwidth=bandwidth, snr_db=snr_db, seed=seed + index
         )
@@ -99,15 +99,12 @@ def array_instrument(array: PlanarArray, method: str) -> Instrument:
 
     Capon adapts its beam to the signals; it is given the Bartlett beam's figures.
     """
-    boresight = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
-    centre = manifold(array, boresight)
-    R = centre[:, None] * centre.conj() / array.peak_gain
-    fixed = "tapered" if method == "tapered" else "bartlett"
+    taper = hann_taper(array) if method == "tapered" else torch.ones(array.count, dtype=torch.float64)
+    weights = (taper / taper.sum() / math.sqrt(array.peak_gain)).to(torch.complex64)
     sphere = equirect_grid(180, 90)
-    beam = beamform(fixed, R, manifold(array, sphere.directions.double()), array)
-    angle = torch.linspace(0.0, math.pi / 2, 2001, dtype=torch.float64)
+    beam = (manifold(array, sphere.directions) @ weights).abs().square()
+    angle = torch.linspace(0.0, math.pi / 2, 1001)
     cut = torch.stack((torch.cos(angle), torch.sin(angle), torch.zeros_like(angle)), -1)
-    steering = manifold(PlanarArray(array.rows, array.cols, "isotropic", array.vertical, array.horizontal), cut)
-    below = torch.nonzero(beamform(fixed, R, steering, array) < 0.5)
+    below = torch.nonzero((manifold(array, cut) @ weights).abs().square() < 0.5)
     half = float(angle[below[0, 0]]) if len(below) else math.pi / 2
     return Instrument(f"{array.label} {method}", 2 * half, float((beam * sphere.solid_angle).sum()))

@@ -60,7 +60,7 @@ def ideal_spectrum(
         )
     batch = paths.coeff.shape[:-1]
     pose = pose_for(paths, pose)
-    rows = paths._map(lambda value: value.reshape(-1, value.shape[-1]), rx=_flat(paths.rx))
+    rows = paths.flat()
     world_from_device = pose.world_from_device.reshape(-1, 3, 3)
     lobe_sum = LobeSum(grid, width)
     sums = torch.empty(len(rows.rx), *grid.shape, CHANNELS)
@@ -98,10 +98,6 @@ def pose_for(paths: Paths, pose: Pose | None) -> Pose:
     if pose.batch_shape:
         raise InputError(f"pose must be one pose or {list(batch)}, one per receiver; got {list(pose.batch_shape)}")
     return Pose(pose.position.expand(*batch, 3), pose.orientation.expand(*batch, 4))
-
-
-def _flat(pose: Pose) -> Pose:
-    return Pose(pose.position.reshape(-1, 3), pose.orientation.reshape(-1, 4))
 
 
 class LobeSum:
