@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.errors import InputError
+from rf3dgs.splats.backends.native import evaluate_harmonics, takes
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
@@ -73,7 +74,12 @@ def evaluate(sh: Tensor, directions: Tensor, *, offset: float = 0.0, clamp: bool
             f"sh must be [gaussian, k, channel] and directions [gaussian, 3]; got {list(sh.shape)} and "
             f"{list(directions.shape)}"
         )
-    values = torch.einsum("gk,gkc->gc", basis(directions, degree_of(sh.shape[1])), sh) + offset
+    degree = degree_of(sh.shape[1])
+    if takes(sh, directions) and not directions.requires_grad:
+        values = evaluate_harmonics(sh, directions)
+    else:
+        values = torch.einsum("gk,gkc->gc", basis(directions, degree), sh)
+    values = values + offset if offset else values
     return values.clamp_min(0.0) if clamp else values
 
 

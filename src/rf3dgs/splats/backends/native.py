@@ -30,7 +30,9 @@ def core() -> ModuleType:
 
 def takes(*tensors: Tensor | None) -> bool:
     """True when the core is there and all tensors are float32 on the CPU."""
-    fits = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors if tensor is not None)
+    fits = all(
+        tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in tensors if tensor is not None
+    )
     return fits and native_core() is not None
 
 
