@@ -95,3 +95,22 @@ def test_wrong_counts_are_refused() -> None:
         basis(directions(1), 4)
     with pytest.raises(InputError, match=r"sh must be \[gaussian, k, channel\]"):
         evaluate(torch.zeros(2, 4, 1), torch.zeros(3, 3))
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5])
+def test_single_precision_equals_double_with_its_gradient(channels: int) -> None:
+    """Single precision goes through the native core where it is built."""
+    exact = torch.randn(40, 16, channels, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    direction = directions(40)
+    quick = exact.float().requires_grad_()
+    exact.requires_grad_()
+    weights = torch.arange(40.0 * channels).reshape(40, channels) / 40
+    for sh, along in ((exact, direction), (quick, direction.float())):
+        values = evaluate(sh, along, offset=0.5, clamp=True)
+        (values * weights.to(values.dtype)).sum().backward()
+    assert torch.allclose(
+        evaluate(quick, direction.float(), offset=0.5), evaluate(exact, direction, offset=0.5).float()
+    )
+    assert exact.grad is not None
+    assert quick.grad is not None
+    assert torch.allclose(quick.grad, exact.grad.float(), atol=1e-5)
