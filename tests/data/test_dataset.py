@@ -67,7 +67,7 @@ def test_any_spectra_survive_the_file(tmp_path, data):
         power, delay, aod = power.reshape(count, 1, -1), delay.reshape(count, 1, -1), aod.reshape(count, 1, -1, 3)
     pose = Pose(torch.randn(count, 3, generator=generator), torch.randn(count, 4, generator=generator))
     spectrum = Spectrum(power, grid, pose, 2.4e9, Instrument.gaussian(0.1), "ideal", delay, aod)
-    write_spectra(tmp_path / "spectra.h5", spectrum, None, None, Precision())
+    write_spectra(tmp_path / "spectra.h5", spectrum)
     found, repeat, index = read_spectra(tmp_path / "spectra.h5")
     assert repeat is None
     assert index is None
@@ -105,11 +105,13 @@ def test_stored_arrays_state_scale_offset_unit_and_missing(saved):
             assert item.compression == "gzip"
             assert item.chunks[0] == 1
         assert file["spectra"].attrs["frequency_unit"] == "Hz"
+        assert file.attrs["generator"] == "test"
+        assert file.attrs["seed"] == "0"
         assert file["spectra"]["position"].attrs["unit"] == "m"
 
 
 def test_power_below_the_floor_is_stored_as_no_power(spectra, tmp_path):
-    write_spectra(tmp_path / "s.h5", spectra, None, None, Precision(floor_db=-115.0))
+    write_spectra(tmp_path / "s.h5", spectra, how=Precision(floor_db=-115.0))
     found, _, _ = read_spectra(tmp_path / "s.h5")
     kept = spectra.gain_db >= -115.0
     assert torch.equal(found.power > 0, kept)
@@ -274,7 +276,7 @@ def test_changed_or_truncated_spectra_are_refused(saved):
 )
 def test_spectra_in_other_units_are_refused_by_name(spectra, tmp_path, where, attribute, value, message):
     path = tmp_path / "s.h5"
-    write_spectra(path, spectra, None, None, Precision())
+    write_spectra(path, spectra)
     with h5py.File(path, "r+") as file:
         file[where].attrs[attribute] = value
     with pytest.raises(DataError, match=rf"s\.h5.*{message}"):

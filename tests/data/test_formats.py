@@ -12,13 +12,13 @@ from PIL import Image
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose, opengl_from_viewmat
 from rf3dgs.core.grids import Camera, pinhole_grid
-from rf3dgs.core.units import power_from_db
 from rf3dgs.data.formats.blender import read_blender
 from rf3dgs.data.formats.colmap import read_colmap, read_model, write_colmap
 from rf3dgs.data.formats.detect import read_photos
 from rf3dgs.data.formats.nerfstudio import read_nerfstudio, write_nerfstudio
 from rf3dgs.data.formats.rf3dgs_v0 import level_of, read_rf3dgs_v0
 from rf3dgs.data.photo import Photo
+from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Instrument
 
 
@@ -243,11 +243,6 @@ def test_blender_files_are_read_with_their_roles(photos, tmp_path):
         read_blender(tmp_path)
 
 
-class _Window:
-    def decode(self, values):
-        return power_from_db(-145 + 40 * values)
-
-
 def _v0_site(photos, tmp_path, *, jet=False):
     site = tmp_path / "site"
     write_colmap(site, photos)
@@ -269,7 +264,7 @@ def _v0_site(photos, tmp_path, *, jet=False):
 @pytest.mark.parametrize("jet", [False, True])
 def test_rf3dgs_v0_pictures_become_spectra_through_the_users_window(photos, tmp_path, jet):
     site, ramp = _v0_site(photos, tmp_path, jet=jet)
-    found = read_rf3dgs_v0(site, _Window(), frequency=2.4e9, instrument=Instrument.gaussian(0.1))
+    found = read_rf3dgs_v0(site, DbWindow(-145.0, -105.0), frequency=2.4e9, instrument=Instrument.gaussian(0.1))
     assert found.roles == ("train",) * 4 + ("test",) * 2
     part = found.train
     assert part.spectra.grid.kind == "pinhole"

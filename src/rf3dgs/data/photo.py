@@ -1,7 +1,7 @@
 """`Photo`: a picture and the camera that took it."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -78,11 +78,6 @@ def photo_of_file(name: str, camera: Camera, path: Path, *, note: str = "") -> P
             )
         camera = camera.resized(width, height)
     return Photo(name, camera, path, note=note)
-
-
-def moved(photo: Photo, camera: Camera) -> Photo:
-    """The same picture with another camera."""
-    return replace(photo, camera=camera)
 
 
 def check_camera(viewmat: Tensor, K: Tensor, *, where: str) -> None:

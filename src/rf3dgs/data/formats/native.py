@@ -127,7 +127,7 @@ def _write(dataset: Dataset, folder: Path, precision: Precision) -> None:
     manifest["spectra"] = manifest["photos"] = None
     if spectra is not None:
         with atomic_file(folder / SPECTRA) as temporary:
-            write_spectra(temporary, spectra, repeat, dataset.repeat_index, precision)
+            write_spectra(temporary, spectra, repeat, dataset.repeat_index, precision, meta=dataset.meta)
         manifest["spectra"] = {
             "sha256": sha256_of(folder / SPECTRA),
             "count": len(spectra),

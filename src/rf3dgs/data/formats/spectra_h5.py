@@ -5,8 +5,10 @@ Every array says in its attributes `scale`, `offset`, `unit` and `missing` how a
 two components in [-1, 1], stored one after the other (`aod` `[position, 2, row, col]`).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -39,10 +41,24 @@ class Precision:
     """Power below this [dB] is stored as no power, without delay and departure; None stores all."""
 
 
-def write_spectra(path: Path, spectra: Spectrum, repeat: Spectrum | None, index: Tensor | None, how: Precision) -> None:
-    """Write spectra `[position]`, and a second solve `repeat` of the positions `index`, to an HDF5 file."""
+def write_spectra(
+    path: Path,
+    spectra: Spectrum,
+    repeat: Spectrum | None = None,
+    index: Tensor | None = None,
+    how: Precision | None = None,
+    *,
+    meta: Mapping[str, Any] | None = None,
+) -> None:
+    """Write spectra `[position]`, and a second solve `repeat` of the positions `index`, to an HDF5 file.
+
+    `meta`: its "generator" (what made the spectra) and "seed" become attributes.
+    """
+    how = how or Precision()
+    meta = meta or {}
     with h5py.File(path, "w", libver=("earliest", "v110")) as file:
         file.attrs["schema"], file.attrs["version"] = SCHEMA, VERSION
+        file.attrs["generator"], file.attrs["seed"] = str(meta.get("generator", "")), str(meta.get("seed", ""))
         _write_group(file.create_group("spectra"), spectra, how)
         if repeat is not None and index is not None:
             group = file.create_group("repeat")
