@@ -21,7 +21,7 @@ from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.spectra.codec import DbWindow, PaperEncoding
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import basis, view_directions
-from rf3dgs.splats.rasterize import rasterize
+from rf3dgs.splats.rasterize import Backend, rasterize
 
 NANOSECOND = 1e-9
 CSI_CHANNELS = {"vector": 4, "paper": 3}
@@ -151,7 +151,7 @@ def csi_values(surface: Surface, centre: Tensor, directions: Tensor) -> Tensor:
     return csi_prior(surface.means, surface.tx, centre) + learned
 
 
-def picture_of(surface: Surface, camera: Camera, *, csi: bool = True, backend: str = "auto") -> Tensor:
+def picture_of(surface: Surface, camera: Camera, *, csi: bool = True, backend: Backend = "auto") -> Tensor:
     """The channels `[row, col, 2 + CSI]` described above, without gradients; `csi=False` gives the first two alone."""
     with torch.no_grad():
         seen = surface.select(in_view(surface.means, reach_of(surface.scales), camera))

@@ -20,6 +20,7 @@ from rf3dgs.field.radiance import Radiance, Surface, decode, picture_of
 from rf3dgs.field.sources import Blockers, PointSource
 from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
+from rf3dgs.splats.rasterize import Backend
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +43,7 @@ class RadioField:
     bounds: Tensor
     colour: Tensor
     meta: dict[str, str | int | float | bool] = field(default_factory=dict)
-    backend: str = "auto"
+    backend: Backend = "auto"
 
     @property
     def blockers(self) -> Blockers:

@@ -1,70 +1,90 @@
 """A first solution of the harmonics in closed form: spectra thrown back onto the Gaussians, then ridge regression.
 
-For each view the rasterizer's own gradient gives every Gaussian the mean target over the pixels it decides and how
-much it decides them. Those observations, one per view and Gaussian, make small normal equations that are solved coarse
-to fine: all Gaussians, cells of the room, single Gaussians, each level drawn to the one above.
+For each view the rasterizer's own gradient gives every Gaussian what the picture lacks, as a mean over the pixels that
+it decides, and how much it decides them. Those observations, one per view and Gaussian, make small normal equations
+that are solved coarse to fine: all Gaussians, cells of the room, single Gaussians, each level drawn to the one above.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from rf3dgs.core.frames import matrix_from_quaternion
-from rf3dgs.field.radiance import CSI_DEGREE, Surface, csi_prior, in_view, reach_of
+from rf3dgs.field.radiance import Surface, csi_values, gain_values, in_view, reach_of
 from rf3dgs.splats.harmonics import basis, view_directions
-from rf3dgs.splats.rasterize import rasterize
+from rf3dgs.splats.rasterize import Backend, rasterize
 from rf3dgs.training.radio_views import RadioView
 
 CELLS = (2.0, 0.7)
 HALF_WEIGHT = 0.3
 
 
-def back_project(surface: Surface, view: RadioView, picture: Tensor, backend: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Indices `[n]` of the Gaussians in view, the sum of `picture` `[row, col, C]` over what each decides `[n, C]`,
-    and their directions `[n, 3]`.
-
-    Exactly the gradient of `(rendering * picture).sum()` in the Gaussians' values.
-    """
-    index = in_view(surface.means, reach_of(surface.scales), view.camera)
-    seen = surface.select(index)
-    values = torch.zeros(len(index), picture.shape[-1], requires_grad=True)
-    raster = rasterize(seen.means, seen.quats, seen.scales, seen.opacities, values, view.camera, backend=backend)
-    (sums,) = torch.autograd.grad(raster.values, values, picture)
-    return index, sums, view_directions(seen.means, view.camera.position)
-
-
 def ridge_start(
-    surface: Surface, views: Sequence[RadioView], *, degree: int, ridge: float, backend: str = "auto"
+    surface: Surface,
+    views: Sequence[RadioView],
+    *,
+    degree: int,
+    ridge: float,
+    passes: int = 2,
+    backend: Backend = "auto",
 ) -> tuple[Tensor, Tensor]:
     """Gain harmonics `[N, K]` and, for encoding "vector", CSI harmonics `[N, 4, 4]` that explain the views best.
 
-    `ridge` counts in observations: how many of them the neighbourhood's solution is worth.
+    Each pass solves for what the one before left over. `ridge` counts in observations: how many of them the
+    neighbourhood's solution is worth.
     """
-    count, size = len(surface), (degree + 1) ** 2
-    csi = surface.encoding == "vector" and all(view.csi is not None for view in views)
-    gain = _Normal(count, size, 1)
-    rest = _Normal(count, (CSI_DEGREE["vector"] + 1) ** 2, 4) if csi else None
-    for view in views:
-        parts = [view.keep[..., None], (view.keep * view.gain)[..., None]]
-        if csi:
-            assert view.csi is not None
-            parts += [(view.keep * view.gain)[..., None] * view.csi]
-        index, sums, directions = back_project(surface, view, torch.cat(parts, -1), backend)
-        total = sums[:, 0]
-        weight = total / (total + HALF_WEIGHT)
-        usable = weight > 0.02
-        index, sums, total, weight = index[usable], sums[usable], total[usable], weight[usable]
-        harmonics = basis(directions[usable], degree)
-        gain.add(index, harmonics, sums[:, 1:2] / total[:, None] - 0.5, weight)
-        if rest is not None:
-            power = sums[:, 1]
-            observed = sums[:, 2:6] / power.clamp_min(1e-6)[:, None]
-            error = observed - csi_prior(surface.means[index], surface.tx, view.camera.position)
-            rest.add(index, harmonics[:, :4], error, weight * (power / total) * (power > 1e-6))
     cells = [_cells(surface, cell) for cell in CELLS]
-    solution = gain.solve(cells, ridge)[..., 0]
-    return solution, surface.csi_sh if rest is None else rest.solve(cells, ridge)
+    with_csi = surface.encoding == "vector" and all(view.csi is not None for view in views)
+    size = (degree + 1) ** 2
+    gain_sh, csi_sh = torch.zeros(len(surface), size), torch.zeros_like(surface.csi_sh)
+    for _ in range(passes):
+        gain = _Normal(len(surface), size, 1)
+        csi = _Normal(len(surface), csi_sh.shape[1], csi_sh.shape[2]) if with_csi else None
+        current = replace(surface, gain_sh=gain_sh, csi_sh=csi_sh)
+        for view in views:
+            index, sums, directions = _leftover(current, view, with_csi, backend)
+            total = sums[:, 0]
+            weight = total / (total + HALF_WEIGHT)
+            usable = weight > 0.02
+            index, sums, total, weight = index[usable], sums[usable], total[usable], weight[usable]
+            harmonics = basis(directions[usable], max(degree, 1))
+            gain.add(index, harmonics[:, :size], sums[:, 2:3] / total[:, None], weight)
+            if csi is not None:
+                power = sums[:, 1]
+                left = sums[:, 3:] / power.clamp_min(1e-6)[:, None] * (power > 1e-6)[:, None]
+                csi.add(index, harmonics[:, :4], left, weight * power / total)
+        gain_sh = gain_sh + gain.solve(cells, ridge)[..., 0]
+        if csi is not None:
+            csi_sh = csi_sh + csi.solve(cells, ridge)
+    return gain_sh, csi_sh
+
+
+def _leftover(surface: Surface, view: RadioView, with_csi: bool, backend: Backend) -> tuple[Tensor, Tensor, Tensor]:
+    """Gaussians in view `[n]`, sums `[n, 3 (+ 4)]` over the pixels that each decides, and directions `[n, 3]`.
+
+    The sums are of 1, of the target gain, of what the gain lacks, and of what delay and departure lack times the target
+    gain: the gradient of `(rendering * those pictures).sum()` in the Gaussians' values.
+    """
+    index = in_view(surface.means, reach_of(surface.scales), view.camera)
+    seen = surface.select(index)
+    directions = view_directions(seen.means, view.camera.position)
+    values = torch.cat((torch.zeros(len(index), 2), gain_values(seen.gain_sh, directions)), -1)
+    if with_csi:
+        values = torch.cat((values, csi_values(seen, view.camera.position, directions)), -1)
+    values.requires_grad_()
+    raster = rasterize(seen.means, seen.quats, seen.scales, seen.opacities, values, view.camera, backend=backend)
+    picture = raster.values.detach()
+    reached = view.keep * view.gain
+    parts = [view.keep, reached, view.keep * (view.gain - picture[..., 2])]
+    lacking = torch.stack(parts, -1)
+    if with_csi:
+        assert view.csi is not None
+        shown = picture[..., 3:] / raster.weight.detach().clamp_min(1e-3)[..., None]
+        lacking = torch.cat((lacking, reached[..., None] * (view.csi - shown)), -1)
+    (sums,) = torch.autograd.grad(raster.values, values, lacking)
+    return index, sums, directions
 
 
 class _Normal:
