@@ -1,0 +1,34 @@
+"""Where paths come from: scenes, the ray tracer, and the camera that photographs the same meshes."""
+
+from typing import TYPE_CHECKING
+
+from rf3dgs.core.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from rf3dgs.propagation import sionna as sionna
+    from rf3dgs.propagation.config import PhotoConfig as PhotoConfig
+    from rf3dgs.propagation.config import TraceConfig as TraceConfig
+    from rf3dgs.propagation.llvm import find_llvm as find_llvm
+    from rf3dgs.propagation.photographer import camera_tour as camera_tour
+    from rf3dgs.propagation.photographer import render_photos as render_photos
+    from rf3dgs.propagation.scene import Scene as Scene
+    from rf3dgs.propagation.scene import SceneObject as SceneObject
+    from rf3dgs.propagation.scene_files import write_radio_scene as write_radio_scene
+    from rf3dgs.propagation.scene_files import write_visual_scene as write_visual_scene
+    from rf3dgs.propagation.scenes import scene_of as scene_of
+
+_HOMES = {
+    "Scene": ".scene",
+    "SceneObject": ".scene",
+    "scene_of": ".scenes",
+    "write_radio_scene": ".scene_files",
+    "write_visual_scene": ".scene_files",
+    "TraceConfig": ".config",
+    "sionna": ".sionna",
+    "PhotoConfig": ".config",
+    "camera_tour": ".photographer",
+    "render_photos": ".photographer",
+    "find_llvm": ".llvm",
+}
+__all__ = list(_HOMES)
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -97,8 +97,8 @@ def _sensor(mitsuba, camera: Camera) -> dict:
         "type": "perspective",
         "fov_axis": "x",
         "fov": math.degrees(2 * math.atan(0.5 * camera.width / focal_x)),
-        "principal_point_offset_x": float(camera.K[0, 2]) / camera.width - 0.5,
-        "principal_point_offset_y": float(camera.K[1, 2]) / camera.height - 0.5,
+        "principal_point_offset_x": 0.5 - float(camera.K[0, 2]) / camera.width,
+        "principal_point_offset_y": 0.5 - float(camera.K[1, 2]) / camera.height,
         "near_clip": 0.02,
         "to_world": mitsuba.ScalarTransform4f(matrix.numpy()),
         "film": {

@@ -42,7 +42,10 @@ def write_radio_scene(scene: Scene, folder: str | Path, *, frequency: float | No
 
 
 def write_visual_scene(scene: Scene, folder: str | Path) -> Path:
-    """Write `visual.xml` (Mitsuba 3), `textures/*.png` and `meshes/*.ply`; returns the XML's path."""
+    """Write `visual.xml` (Mitsuba 3), `textures/*.png` and `meshes/*.ply`; returns the XML's path.
+
+    A scene without sky and without luminous objects gets a lamp under its ceiling.
+    """
     folder = Path(folder)
     root = ET.Element("scene", version=VERSION)
     integrator = ET.SubElement(root, "integrator", type="path")
@@ -50,6 +53,12 @@ def write_visual_scene(scene: Scene, folder: str | Path) -> Path:
     if scene.sky > 0:
         sky = ET.SubElement(root, "emitter", type="constant")
         _value(sky, "rgb", "radiance", ", ".join(str(round(scene.sky * part, 4)) for part in (0.88, 0.94, 1.0)))
+    elif all(item.glow == 0 for item in scene.objects):
+        lamp = ET.SubElement(root, "emitter", type="point")
+        (x0, y0, z0), (x1, y1, z1) = scene.bounds
+        position = [f"{value:.4f}" for value in ((x0 + x1) / 2, (y0 + y1) / 2, z0 + 0.9 * (z1 - z0))]
+        ET.SubElement(lamp, "point", name="position", **dict(zip("xyz", position, strict=True)))
+        _value(lamp, "rgb", "intensity", str(round(0.3 * scene.size**2, 4)))
     for item in scene.objects:
         shape = _shape(root, item, folder)
         outer = ET.SubElement(shape, "bsdf", type="twosided")

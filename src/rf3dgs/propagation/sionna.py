@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rf3dgs.channel.binning import bin_diffuse, stack_paths
+from rf3dgs.channel.binning import DIFFUSE, bin_diffuse, stack_paths
 from rf3dgs.channel.paths import Paths
 from rf3dgs.core.errors import InputError, MissingDependencyError, RfError
 from rf3dgs.core.frames import Pose
@@ -127,55 +127,64 @@ class Tracer:
             self._solver = rt.PathSolver(deterministic=True)
 
     def paths(self, tx: Pose, rx: Pose, config: TraceConfig, seed: int) -> Paths:
-        """All paths `[1, path]` to the one receiver `rx` `[1]`, sorted by delay, then by angles."""
+        """All paths `[1, path]` to the one receiver `rx` `[1]`, sorted by delay, then by angles.
+
+        Line of sight and mirrors are those of the first pass; the diffuse paths of all passes share their power.
+        """
         scene, rt = self._scene, self._rt
-        # A ray leaves at most one candidate per bounce, and the line of sight is one more: this room is never filled.
-        room = config.rays * max(config.depth, 1) + 10_000
         with mitsuba_variant(VARIANT):
             for name in [*scene.transmitters, *scene.receivers]:
                 scene.remove(name)
             scene.add(rt.Transmitter("tx", position=tx.position.tolist()))
             scene.add(rt.Receiver("rx", position=rx.position[0].tolist()))
-            found = self._solver(
-                scene,
-                max_depth=config.depth,
-                samples_per_src=config.rays,
-                max_num_paths_per_src=room,
-                synthetic_array=True,
-                los=config.line_of_sight,
-                specular_reflection=config.specular,
-                diffuse_reflection=config.diffuse,
-                refraction=False,
-                diffraction=False,
-                seed=seed,
-            )
-            real, imaginary = (np.array(part)[0, :, 0] for part in found.a)
-            valid = np.array(found.valid)[0, 0]
-            angles = [np.array(part)[0, 0] for part in (found.theta_r, found.phi_r, found.theta_t, found.phi_t)]
-            delay = np.array(found.tau)[0, 0]
-            kinds = np.array(found.interactions).reshape(-1, 1, 1, len(valid))[:, 0, 0]
+            passes = [self._solve(config, number, seed) for number in range(config.passes)]
+        columns = [np.concatenate(parts) for parts in zip(*passes, strict=True)]
+        return _paths(columns, self._frequency, tx, rx)
+
+    def _solve(self, config: TraceConfig, number: int, seed: int) -> tuple[NDArray, ...]:
+        """Amplitude, delay, four angles, order and kind `[path]` of the valid paths of pass `number`."""
+        rays = config.rays + 1009 * number  # another count is another Fibonacci lattice
+        # A ray leaves at most one candidate per bounce, and the line of sight is one more: this room is never filled.
+        room = rays * max(config.depth, 1) + 10_000
+        found = self._solver(
+            self._scene,
+            max_depth=config.depth,
+            samples_per_src=rays,
+            max_num_paths_per_src=room,
+            synthetic_array=True,
+            los=config.line_of_sight and number == 0,
+            specular_reflection=config.specular,
+            diffuse_reflection=config.diffuse,
+            refraction=False,
+            diffraction=False,
+            seed=seed + 1_000_003 * number,
+        )
+        valid = np.array(found.valid)[0, 0]
         if len(valid) >= room:
-            raise RfError(f"the tracer's room for {room} paths is full, so paths may be missing; raise rays or lower depth")
-        return _paths(real + 1j * imaginary, delay, angles, kinds, valid, self._frequency, tx, rx)
+            raise RfError(f"the tracer's room for {room} paths is full, so paths may be missing; use fewer rays")
+        kinds = np.array(found.interactions).reshape(-1, len(valid))
+        order = (kinds > 0).sum(0)
+        kind = np.bitwise_or.reduce(kinds, axis=0) if len(kinds) else np.zeros_like(order)
+        scattered = (kind & DIFFUSE) > 0
+        valid = valid & (scattered | (number == 0))
+        real, imaginary = (np.array(part)[0, :, 0] for part in found.a)
+        power = 0.5 * (real**2 + imaginary**2).sum((0, 1)) / np.where(scattered, config.passes, 1)
+        amplitude = np.sqrt(power) * np.exp(1j * np.arctan2(imaginary[0, 0], real[0, 0]))
+        angles = (np.array(part)[0, 0] for part in (found.theta_r, found.phi_r, found.theta_t, found.phi_t))
+        return tuple(column[valid] for column in (amplitude, np.array(found.tau)[0, 0], *angles, order, kind))
 
 
-def _paths(
-    a: NDArray, delay: NDArray, angles: list[NDArray], kinds: NDArray, valid: NDArray, frequency: float, tx: Pose, rx: Pose
-) -> Paths:
-    """Sionna's arrays as `Paths` `[1, path]`: `a` [rx polarisation, tx polarisation, path], `kinds` [depth, path]."""
-    a, delay, kinds, angles = a[..., valid], delay[valid], kinds[:, valid], [angle[valid] for angle in angles]
-    power = 0.5 * (np.abs(a) ** 2).sum((0, 1))
-    coeff = np.sqrt(power) * np.exp(1j * np.angle(a[0, 0]))
-    order = (kinds > 0).sum(0)
-    kind = np.bitwise_or.reduce(kinds, axis=0) if len(kinds) else np.zeros_like(order)
-    rank = np.lexsort((power, kind, *angles[::-1], delay))
+def _paths(columns: list[NDArray], frequency: float, tx: Pose, rx: Pose) -> Paths:
+    """Amplitude, delay, four angles, order and kind as sorted `Paths` `[1, path]`."""
+    amplitude, delay, *angles, order, kind = columns
+    rank = np.lexsort((np.abs(amplitude), kind, *angles[::-1], delay))
 
     def column(value: NDArray, dtype: torch.dtype) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(value[rank])).to(dtype)[None]
 
     zenith, azimuth, zenith_tx, azimuth_tx = (column(angle, torch.float32) for angle in angles)
     return Paths(
-        coeff=column(coeff, torch.complex64),
+        coeff=column(amplitude, torch.complex64),
         delay=column(delay, torch.float32),
         aoa_zenith=zenith,
         aoa_azimuth=azimuth,
@@ -194,8 +203,11 @@ def _check(scene: Scene, tx: Pose, rx: Pose, config: TraceConfig, frequency: flo
     """Refuse what cannot be traced, naming the receiver and what is in its way."""
     if tx.batch_shape or len(rx.batch_shape) != 1:
         raise InputError(f"tx must be one pose and rx a list [rx]; got {tx.batch_shape} and {rx.batch_shape}")
-    if config.rays < 1 or config.depth < 0:
-        raise InputError(f"rays must be positive and depth not negative; got {config.rays} and {config.depth}")
+    if config.rays < 1 or config.passes < 1 or config.depth < 0:
+        raise InputError(
+            f"rays and passes must be positive and depth not negative; "
+            f"got {config.rays}, {config.passes} and {config.depth}"
+        )
     if not 1e8 <= frequency <= 1e12:
         raise InputError(f"frequency must be in hertz, between 100 MHz and 1 THz; got {frequency:g}")
     if scene.source is None:

@@ -1,0 +1,110 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import Camera, pinhole_grid
+from rf3dgs.propagation import shapes
+from rf3dgs.propagation.config import PhotoConfig
+from rf3dgs.propagation.photographer import camera_tour, render_photos
+from rf3dgs.propagation.scene import SceneObject
+
+QUICK = PhotoConfig(width=80, height=60, samples=8, bounces=3)
+
+
+def glowing(name, low, high, colour):
+    vertices, faces, _ = shapes.box(low, high)
+    return SceneObject(name, vertices, faces, "metal", 0.5, colour=colour, glow=1.0)
+
+
+@pytest.fixture(scope="module")
+def marked(site, tracer):
+    """A dark room with a red marker ahead to the left, a green one ahead to the right and a blue one above."""
+    floor = replace(site["floor"], texture=None, colour=(0.05, 0.05, 0.05))
+    markers = (
+        glowing("red", (9.8, 8.8, 1.3), (10.2, 9.2, 1.7), (1.0, 0.0, 0.0)),
+        glowing("green", (9.8, 5.8, 1.3), (10.2, 6.2, 1.7), (0.0, 1.0, 0.0)),
+        glowing("blue", (9.8, 7.3, 2.6), (10.2, 7.7, 3.0), (0.0, 0.0, 1.0)),
+    )
+    return replace(site, objects=(floor, *markers))
+
+
+@pytest.mark.parametrize("off_centre", [False, True])
+def test_a_photograph_shows_things_where_its_camera_says(marked, off_centre):
+    pose = Pose.look_at((5.0, 7.2, 1.4), (10.0, 7.6, 1.7))
+    grid = pinhole_grid(80, 60, 80.0)
+    if off_centre:
+        K = grid.K + torch.tensor([[0.0, 0.0, 9.0], [0.0, 0.0, -6.0], [0.0, 0.0, 0.0]])
+        grid = pinhole_grid(80, 60, K=K)
+    camera = Camera.of(pose, grid)
+    (photo,) = render_photos(marked, [camera], QUICK)
+    assert photo.shape == (60, 80, 3)
+    assert photo.dtype == np.uint8
+    for channel, centre in enumerate(((10.0, 9.0, 1.5), (10.0, 6.0, 1.5), (10.0, 7.5, 2.8))):
+        own = photo[..., channel].astype(int)
+        rest = np.delete(photo, channel, axis=2).max(-1)
+        rows, cols = np.nonzero((own > 150) & (rest < 80))
+        direction = (torch.tensor(centre) - pose.position) @ pose.world_from_device
+        pixel, inside = camera.grid.pixel_of(direction)
+        assert bool(inside)
+        assert (cols.mean() + 0.5, rows.mean() + 0.5) == pytest.approx(tuple(pixel.tolist()), abs=1.2)
+
+
+def test_left_is_left_and_up_is_up(marked):
+    camera = Camera.of(Pose.look_at((5.0, 7.5, 1.4), (10.0, 7.5, 1.4)), pinhole_grid(80, 60, 80.0))
+    (photo,) = render_photos(marked, [camera], QUICK)
+    red, green, blue = (np.argwhere(photo[..., channel] > 150).mean(0) for channel in range(3))
+    assert red[1] < 40 < green[1]
+    assert blue[0] < red[0]
+
+
+def test_the_lobby_is_well_exposed_and_the_same_on_every_run(site, tracer):
+    cameras = camera_tour(site, 3, seed=5, config=QUICK)[:2]
+    photos = list(render_photos(site, cameras, QUICK))
+    for photo in photos:
+        assert 60 < photo.mean() < 200
+        assert photo.std() > 20
+        assert (photo == 255).all(-1).mean() < 0.2
+    (again,) = render_photos(site, cameras[:1], QUICK)
+    assert np.array_equal(photos[0], again)
+
+
+def test_a_room_without_lights_gets_a_lamp(tracer):
+    from rf3dgs.propagation.scenes import scene_of
+
+    box = scene_of("box")
+    (photo,) = render_photos(box, camera_tour(box, 1, seed=0, config=QUICK), QUICK)
+    assert photo.mean() > 20
+
+
+def test_tracing_works_after_photographing_and_the_other_way_round(site, tracer, marked):
+    from rf3dgs.propagation.config import TraceConfig
+
+    rx = site.receivers(1, seed=1)
+    config = TraceConfig(rays=5_000, depth=1)
+    camera = Camera.of(Pose.look_at((5.0, 7.2, 1.4), (10.0, 7.6, 1.7)), pinhole_grid(32, 24, 80.0))
+    (before,) = tracer.trace_each(site, None, rx, config)
+    photos = render_photos(marked, [camera, camera], QUICK)
+    next(photos)
+    (between,) = tracer.trace_each(site, None, rx, config)
+    next(photos)
+    (after,) = tracer.trace_each(site, None, rx, config)
+    assert torch.equal(before.coeff, between.coeff)
+    assert torch.equal(before.coeff, after.coeff)
+
+
+def test_the_tour_stands_in_free_space_and_sees_walls_floor_and_ceiling(site):
+    cameras = camera_tour(site, 48, seed=0)
+    positions = torch.stack([camera.position for camera in cameras])
+    assert bool(site.free(positions, 0.4).all())
+    nearest = torch.cdist(positions, positions) + 100 * torch.eye(48)
+    assert float(nearest.min()) > 0.8
+    forward = torch.stack([camera.pose.world_from_device[:, 0] for camera in cameras])
+    assert int((forward[:, 2] > 0.3).sum()) >= 8
+    assert int((forward[:, 2] < -0.3).sum()) >= 8
+    yaw = torch.rad2deg(torch.atan2(forward[:, 1], forward[:, 0]))
+    assert torch.histc(yaw, 8, -180, 180).min() >= 2
+    again = camera_tour(site, 48, seed=0)
+    assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(cameras, again, strict=True))
