@@ -84,7 +84,11 @@ def position_map(
         axis.add_collection(PolyCollection(areas, facecolor="#e3e6ea", edgecolor="#e3e6ea", linewidth=0.4))
         axis.add_collection(LineCollection(walls, colors="#7c838c", linewidths=1.1))
         names = np.array(roles)
-        for role, marker, colour, size in (("train", "o", "#9aa1aa", 16), ("validation", "v", "#9aa1aa", 20)):
+        for role, marker, colour, size in (
+            ("train", "o", "#9aa1aa", 16),
+            ("validation", "v", "#9aa1aa", 20),
+            ("buffer", "x", "#c3c8ce", 14),
+        ):
             chosen = positions[names == role]
             if len(chosen):
                 axis.scatter(chosen[:, 0], chosen[:, 1], s=size, marker=marker, color=colour, label=role, zorder=3)

@@ -56,7 +56,7 @@ svg.bar { width:100%; max-width:460px; height:auto; display:block; }
 .bars { display:flex; flex-wrap:wrap; gap:4px 24px; margin:8px 0 0; }
 .scales { display:flex; flex-direction:column; justify-content:center; gap:18px; }
 .bars > * { flex:1 1 260px; }
-.time { display:block; height:9px; background:var(--accent); border-radius:2px; min-width:2px; }
+.time { display:block; margin-top:8px; height:9px; background:var(--accent); border-radius:2px; min-width:2px; }
 pre { background:var(--wash); border:1px solid var(--line); border-radius:6px; padding:10px 12px; overflow-x:auto;
   font:13.5px/1.45 ui-monospace,"SF Mono",Menlo,Consolas,monospace; white-space:pre-wrap; overflow-wrap:anywhere; }
 details { margin-top:14px; } summary { cursor:pointer; color:var(--accent); }

@@ -87,7 +87,9 @@ class ReportInputs:
     command: str = ""
     """The command that makes this report again."""
     window: DbWindow | None = None
-    """dB window of the pictures; default the first evaluation's."""
+    """dB window of errors and masks; default the first evaluation's."""
+    colours: DbWindow | None = None
+    """Levels [dB] at the ends of the colour scale; default what shows most of the true examples."""
 
 
 def write_report(path: str | Path, inputs: ReportInputs) -> Path:
@@ -193,17 +195,19 @@ def _spectra(inputs: ReportInputs) -> list[str]:
     window = inputs.window
     if window is None or not inputs.examples:
         return []
-    scales = _scales(window)
+    colours = _colour_range(inputs.examples) if inputs.colours is None else inputs.colours
+    scales = _scales(colours)
     parts = [
         page.note(
             "Looking out of the receiver: up is up, left is left. The ring marks the strongest direction. All levels "
-            "share one colour scale; errors are prediction minus truth inside the window: red too strong, blue weak."
+            "share one colour scale, which ends where it shows the room best: stronger directions are as bright as its "
+            "end. Errors are prediction minus truth inside the window of the table: red too strong, blue too weak."
         )
     ]
     for example in inputs.examples:
         views = {"truth": example.truth, FIELD: example.field, "nearest": example.nearest}
         shown = [
-            page.figure(panel(spectrum_picture(view, window), view.grid, name, mark=_strongest(view)), caption)
+            page.figure(panel(spectrum_picture(view, colours), view.grid, name, mark=_strongest(view)), caption)
             for (name, view), caption in zip(views.items(), ("Truth", "Field", "Nearest neighbour"), strict=True)
             if view is not None
         ]
@@ -221,6 +225,13 @@ def _scales(window: DbWindow) -> str:
     level = colour_bar(coloured(ramp), even_ticks(window.floor_db, window.ceil_db), "power [dB]")
     gap = colour_bar(coloured(ramp, DIFFERENCE_COLOURS), even_ticks(-SPAN_DB, SPAN_DB, count=4), "error [dB]")
     return f'<div class="scales">{level}{gap}</div>'
+
+
+def _colour_range(examples: Sequence[SpectrumExample]) -> DbWindow:
+    """From the 3rd to the 99.7th percentile of the true levels of all examples, in whole dB."""
+    levels = torch.cat([example.truth.gain_db[example.truth.power > 0] for example in examples]).numpy()
+    low, high = np.percentile(levels, (3.0, 99.7))
+    return DbWindow(float(np.floor(low)), float(max(np.ceil(high), np.floor(low) + 10.0)))
 
 
 def _strongest(spectrum: Spectrum) -> tuple[float, float]:

@@ -52,20 +52,27 @@ _PEAK = "angle between the strongest predicted and the strongest true direction"
 _DISTINCT = "the same on views whose strongest true peak leads the second by at least 1 dB"
 
 SCORES = (
-    Score("peak_median", "Main peak, median", "deg", "lower", "peak_deg", "median", 2, f"Median {_PEAK}."),
-    Score("peak_p90", "Main peak, P90", "deg", "lower", "peak_deg", "p90", 1, f"90th percentile of the {_PEAK}."),
+    Score("peak_median", "Main peak (median)", "deg", "lower", "peak_deg", "median", 2, f"Median {_PEAK}."),
+    Score("peak_p90", "Main peak (P90)", "deg", "lower", "peak_deg", "p90", 1, f"90th percentile of the {_PEAK}."),
     Score("peak_within_1", "Main peak within 1 deg", "%", "higher", "peak_deg", "within_1", 0, "Share of positions."),
     Score(
-        "distinct_median", "Distinct peak, median", "deg", "lower", "distinct_deg", "median", 2, f"Median: {_DISTINCT}."
+        "distinct_median",
+        "Distinct peak (median)",
+        "deg",
+        "lower",
+        "distinct_deg",
+        "median",
+        2,
+        f"Median: {_DISTINCT}.",
     ),
-    Score("distinct_p90", "Distinct peak, P90", "deg", "lower", "distinct_deg", "p90", 1, f"P90: {_DISTINCT}."),
+    Score("distinct_p90", "Distinct peak (P90)", "deg", "lower", "distinct_deg", "p90", 1, f"P90: {_DISTINCT}."),
     Score("distinct_within_1", "Distinct peak within 1 deg", "%", "higher", "distinct_deg", "within_1", 0, "Share."),
     Score(
-        *("beam_loss_peak", "Beam loss, steered to peak", "dB", "lower", "beam_loss_peak_db", "mean", 2),
+        *("beam_loss_peak", "Beam loss (steered to peak)", "dB", "lower", "beam_loss_peak_db", "mean", 2),
         "Power lost by a beam steered to the predicted main peak instead of the true one, on the true covariance.",
     ),
     Score(
-        *("beam_loss_eigen", "Beam loss, eigenbeam", "dB", "lower", "beam_loss_eigen_db", "mean", 2),
+        *("beam_loss_eigen", "Beam loss (eigenbeam)", "dB", "lower", "beam_loss_eigen_db", "mean", 2),
         "Power lost by the principal eigenvector of the predicted covariance on the true one, mean of the panels.",
     ),
     Score(

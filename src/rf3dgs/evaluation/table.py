@@ -109,11 +109,11 @@ class Evaluation:
         return Estimate(score.of(values), float(low), float(high))
 
     def best(self, key: str) -> tuple[str, ...]:
-        """The methods with the best number as shown, the ceiling left out; none when fewer than two have one."""
+        """The methods with the best number as shown, the ceiling left out; none when all show the same."""
         score = SCORE[key]
         values = {name: self.value(name, key) for name in (FIELD, *self.baselines)}
         values = {name: value for name, value in values.items() if not math.isnan(value)}
-        if len(values) < 2:
+        if len({score.text(value) for value in values.values()}) < 2:
             return ()
         top = max(values.values()) if score.better == "higher" else min(values.values())
         return tuple(name for name, value in values.items() if score.text(value) == score.text(top))
