@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import Literal
 
 import torch
@@ -94,6 +95,7 @@ def beamform(method: str, R: Tensor, A: Tensor, array: PlanarArray, *, loading: 
     return capon(R, A, loading)
 
 
+@lru_cache(maxsize=16)
 def array_instrument(array: PlanarArray, method: str) -> Instrument:
     """The instrument of an array: half-power width in azimuth and solid angle of its beam at boresight.
 
