@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rf3dgs.evaluation.protocol import evaluate as evaluate
     from rf3dgs.field.radio_field import RadioField as RadioField
     from rf3dgs.spectra.spectrum import Spectrum as Spectrum
-    from rf3dgs.spectra.synthesis import spectrum_of as spectrum_of
+    from rf3dgs.spectra.scan import spectrum_of as spectrum_of
     from rf3dgs.splats.gaussians import Gaussians as Gaussians
     from rf3dgs.training.radio import fit_radio as fit_radio
     from rf3dgs.training.visual import fit_geometry as fit_geometry
@@ -37,7 +37,7 @@ _MODULES = {
     "planar_array": ".channel.arrays",
     "ofdm": ".channel.arrays",
     "Spectrum": ".spectra.spectrum",
-    "spectrum_of": ".spectra.synthesis",
+    "spectrum_of": ".spectra.scan",
     "propagation": ".propagation",
     "Dataset": ".data.dataset",
     "Gaussians": ".splats.gaussians",

@@ -20,7 +20,7 @@ from rf3dgs.evaluation.report import PhotoPair, ReportInputs, SpectrumExample
 from rf3dgs.evaluation.table import Evaluation
 from rf3dgs.propagation.config import PhotoConfig, TraceConfig
 from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
-from rf3dgs.spectra.synthesis import spectrum_of
+from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import view_values
 from rf3dgs.splats.rasterize import rasterize
@@ -97,7 +97,7 @@ def make_dataset(
 def geometry_of_mesh(scene: "Scene", count: int, seed: int) -> Gaussians:
     """Flattened Gaussians on the scene's meshes, painted in their colours."""
     vertices, faces, colour = scene.mesh()
-    return sample_mesh(vertices, faces, count=count, seed=seed, colour=colour)
+    return sample_mesh(vertices, faces, count=count, seed=seed, colours=colour)
 
 
 def photo_pairs(geometry: Gaussians, photos: Sequence[Photo]) -> list[PhotoPair]:

@@ -39,11 +39,7 @@ def open_dataset(name: str | Path, *, unseal_test: bool = False) -> "Dataset":
 
 def open_scene(name: str) -> "Scene":
     """The built-in lobby, a scene that ships with Sionna RT, or a Sionna/Mitsuba XML file."""
-    if name == "lobby":
-        from rf3dgs.propagation.lobby import lobby
-
-        return lobby()
-    from rf3dgs.propagation.sionna import scene_of
+    from rf3dgs.propagation.scenes import scene_of
 
     return scene_of(name)
 

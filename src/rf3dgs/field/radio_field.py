@@ -18,6 +18,7 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, DirectionGrid, equirect_grid, face_cameras, sample_faces
 from rf3dgs.field.radiance import Radiance, Surface, decode, picture_of
 from rf3dgs.field.sources import Blockers, PointSource
+from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.rasterize import Backend
@@ -44,6 +45,11 @@ class RadioField:
     colour: Tensor
     meta: dict[str, str | int | float | bool] = field(default_factory=dict)
     backend: Backend = "auto"
+
+    @property
+    def window(self) -> DbWindow:
+        """The dB window in which the surface was trained, and in which pictures of this field are drawn."""
+        return self.surface.window
 
     @property
     def blockers(self) -> Blockers:
