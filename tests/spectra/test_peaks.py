@@ -94,7 +94,7 @@ def test_the_main_peak_is_a_world_direction_per_pose(line_of_sight):
 
 def test_resampling_to_a_pinhole_is_looking_through_it(random_paths):
     paths = random_paths(300)
-    sphere, grid = equirect_grid(360, 180), pinhole_grid(60, 40, 90)
+    sphere, grid = equirect_grid(540, 270), pinhole_grid(60, 40, 90)
     lobe = math.radians(4)
     seen = resample(spectrum_of(paths, grid=sphere, lobe=lobe), grid)
     true = spectrum_of(paths, grid=grid, lobe=lobe)
