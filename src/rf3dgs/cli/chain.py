@@ -19,8 +19,8 @@ from rf3dgs.evaluation.protocol import evaluate
 from rf3dgs.evaluation.report import PhotoPair, ReportInputs, SpectrumExample
 from rf3dgs.evaluation.table import Evaluation
 from rf3dgs.propagation.config import PhotoConfig, TraceConfig
-from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
 from rf3dgs.spectra.scan import spectrum_of
+from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import view_values
 from rf3dgs.splats.rasterize import rasterize

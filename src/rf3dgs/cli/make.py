@@ -110,8 +110,8 @@ class MakeSpectra:
         from rf3dgs.core.progress import track
         from rf3dgs.data.dataset import Dataset
         from rf3dgs.data.formats.detect import read_photos
-        from rf3dgs.spectra.spectrum import stack_spectra
         from rf3dgs.spectra.scan import spectrum_of
+        from rf3dgs.spectra.spectrum import stack_spectra
 
         rows, cols = _size_of(self.array)
         array = None if self.method == "ideal" else planar_array(rows, cols, pattern=self.pattern)
