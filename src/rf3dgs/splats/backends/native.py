@@ -69,7 +69,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         of_picture, of_weight, _ = gradients
         *inputs, shift, picture, weight = ctx.saved_tensors
         if of_picture is None and of_weight is None:
@@ -122,7 +122,7 @@ class _Harmonics(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         (directions,) = ctx.saved_tensors
         result = torch.empty(ctx.shape)
         core().harmonics_backward(_plain(gradients[0]), directions, result, thread_count())
@@ -145,7 +145,7 @@ class _L1Ssim(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, None, None, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, None, None, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         return ctx.gradient * gradients[0], None, None, None
 
 
