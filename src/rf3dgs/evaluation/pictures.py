@@ -1,8 +1,6 @@
 """Pictures of spectra: colours in NumPy, PNG and JPEG bytes, files written whole or not at all."""
 
 import io
-import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +8,7 @@ import torch
 
 from rf3dgs.core.angles import angles_of
 from rf3dgs.core.errors import InputError
+from rf3dgs.core.files import atomic_file
 from rf3dgs.evaluation.metrics import window_picture
 from rf3dgs.spectra.codec import DbWindow, window_of
 from rf3dgs.spectra.spectrum import Spectrum
@@ -138,20 +137,9 @@ def save_spectrum_figure(
 
 
 def write_whole(path: str | Path, content: bytes) -> None:
-    """Write `content` to a temporary file beside `path` and move it into place, so that no half file is ever seen."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    """Write `content` whole or not at all; an older file stays until then. DataError when the disk refuses."""
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(content)
 
 
 def _one(spectrum: Spectrum) -> None:

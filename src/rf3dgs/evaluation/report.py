@@ -23,8 +23,8 @@ from rf3dgs.evaluation.pictures import (
     spectrum_picture,
     write_whole,
 )
-from rf3dgs.evaluation.scores import SCORES
-from rf3dgs.evaluation.table import CEILING, FIELD, Evaluation
+from rf3dgs.evaluation.results import results
+from rf3dgs.evaluation.table import FIELD, Evaluation
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Spectrum
 
@@ -99,7 +99,7 @@ def write_report(path: str | Path, inputs: ReportInputs) -> Path:
         inputs = replace(inputs, window=DbWindow(floor, ceiling))
     sections = (
         page.section("What was measured", page.facts(inputs.facts)),
-        page.section("How good it is", *_verdict(inputs.evaluations), *_tables(inputs.evaluations)),
+        page.section("How good it is", *results(inputs.evaluations)),
         page.section("Photographs and renderings", *_photos(inputs.photos)),
         page.section("True and predicted spectra", *_spectra(inputs)),
         page.section("Delays and angles of departure", *_channel_state(inputs)),
@@ -113,68 +113,6 @@ def write_report(path: str | Path, inputs: ReportInputs) -> Path:
     )
     write_whole(path, page.page(inputs.title, lead, [part for part in sections if part]).encode())
     return Path(path)
-
-
-def _verdict(evaluations: Mapping[str, Evaluation]) -> list[str]:
-    parts = []
-    for name, evaluation in evaluations.items():
-        parts.append(f"<h3>Hold-out: {escape(name)}</h3><p>{escape(evaluation.summary())}</p>")
-        if evaluation.losses:
-            items = "".join(f'<li class="lost">{escape(item.sentence())}</li>' for item in evaluation.losses)
-            parts.append(f"<p>Where the field loses:</p><ul>{items}</ul>")
-        unsure = [item for item in evaluation.wins if not item.clear]
-        if unsure:
-            items = "".join(f"<li>{escape(item.sentence())}</li>" for item in unsure)
-            parts.append(f"<p>Ahead, but not for certain:</p><ul>{items}</ul>")
-    return parts
-
-
-def _tables(evaluations: Mapping[str, Evaluation]) -> list[str]:
-    parts = []
-    for name, evaluation in evaluations.items():
-        heads = "".join(f"<th{_kind(method)}>{escape(method)}</th>" for method in evaluation.methods)
-        rows = []
-        for score in SCORES:
-            unit = f' <span class="unit">[{score.unit}]</span>' if score.unit else ""
-            arrow = (
-                '\N{DOWNWARDS ARROW}<span class="word"> lower</span>'
-                if score.better == "lower"
-                else '\N{UPWARDS ARROW}<span class="word"> higher</span>'
-            )
-            best = evaluation.best(score.key)
-            cells = "".join(_cell(evaluation, method, score, method in best) for method in evaluation.methods)
-            rows.append(f'<tr><th>{score.label}{unit}</th><td class="unit">{arrow}</td>{cells}</tr>')
-        parts.append(
-            f"<h3>Table: {escape(name)}, {len(evaluation)} positions</h3>"
-            f'<div class="scroll"><table><thead><tr><th>score</th><th>better</th>{heads}</tr></thead>'
-            f"<tbody>{''.join(rows)}</tbody></table></div>"
-        )
-    if parts:
-        window = next(iter(evaluations.values())).window
-        parts.append(
-            page.note(
-                "Shaded: the best of the methods that predict. Small print: 95 % bootstrap interval over positions. "
-                f'The window runs from {window[0]:.1f} to {window[1]:.1f} dB. "{CEILING}" is the truth traced again '
-                "with another seed and number of rays: its own noise, and the best that any prediction can show."
-            )
-        )
-        terms = "".join(f"<dt>{s.label}</dt><dd>{escape(s.meaning)}</dd>" for s in SCORES)
-        parts.append(f"<details><summary>What each score means</summary><dl>{terms}</dl></details>")
-    return parts
-
-
-def _cell(evaluation: Evaluation, method: str, score, is_best: bool) -> str:
-    estimate = evaluation.estimate(method, score.key)
-    if np.isnan(estimate.value):
-        return f"<td{_kind(method)}>not available</td>"
-    inside = score.text(estimate.value)
-    if not np.isnan(estimate.low):
-        inside += f'<span class="range">{score.text(estimate.low)} to {score.text(estimate.high)}</span>'
-    return f'<td class="best">{inside}</td>' if is_best else f"<td{_kind(method)}>{inside}</td>"
-
-
-def _kind(method: str) -> str:
-    return ' class="ceiling"' if method == CEILING else ""
 
 
 def _photos(photos: Sequence[PhotoPair]) -> list[str]:
