@@ -12,18 +12,20 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.frames import matrix_from_quaternion
-from rf3dgs.field.radiance import Surface, csi_values, gain_values, in_view, reach_of
+from rf3dgs.field.radiance import Surface, csi_values, gain_values
 from rf3dgs.splats.harmonics import basis, view_directions
 from rf3dgs.splats.rasterize import Backend, rasterize
 from rf3dgs.training.radio_views import RadioView
 
 CELLS = (2.0, 0.7)
 HALF_WEIGHT = 0.3
+LEAST_WEIGHT = 0.02
 
 
 def ridge_start(
     surface: Surface,
     views: Sequence[RadioView],
+    visible: Sequence[Tensor],
     *,
     degree: int,
     ridge: float,
@@ -32,45 +34,44 @@ def ridge_start(
 ) -> tuple[Tensor, Tensor]:
     """Gain harmonics `[N, K]` and, for encoding "vector", CSI harmonics `[N, 4, 4]` that explain the views best.
 
-    Each pass solves for what the one before left over. `ridge` counts in observations: how many of them the
-    neighbourhood's solution is worth.
+    `visible` are the Gaussians `[n]` that may touch each view. Each pass solves for what the one before left over.
+    `ridge` counts in observations: how many of them the neighbourhood's solution is worth.
     """
     cells = [_cells(surface, cell) for cell in CELLS]
     with_csi = surface.encoding == "vector" and all(view.csi is not None for view in views)
     size = (degree + 1) ** 2
-    gain_sh, csi_sh = torch.zeros(len(surface), size), torch.zeros_like(surface.csi_sh)
-    for _ in range(passes):
-        gain = _Normal(len(surface), size, 1)
-        csi = _Normal(len(surface), csi_sh.shape[1], csi_sh.shape[2]) if with_csi else None
-        current = replace(surface, gain_sh=gain_sh, csi_sh=csi_sh)
-        for view in views:
-            index, sums, directions = _leftover(current, view, with_csi, backend)
+    gain = _Normal(len(surface), size, 1)
+    csi = _Normal(len(surface), *surface.csi_sh.shape[1:])
+    for number in range(passes):
+        current = replace(surface, gain_sh=gain.solution[..., 0], csi_sh=csi.solution)
+        gain.right.zero_()
+        csi.right.zero_()
+        for index, view in zip(visible, views, strict=True):
+            sums, directions = _leftover(current.select(index), view, with_csi, backend)
             total = sums[:, 0]
             weight = total / (total + HALF_WEIGHT)
-            usable = weight > 0.02
-            index, sums, total, weight = index[usable], sums[usable], total[usable], weight[usable]
+            usable = weight > LEAST_WEIGHT
+            chosen, sums, total, weight = index[usable], sums[usable], total[usable], weight[usable]
             harmonics = basis(directions[usable], max(degree, 1))
-            gain.add(index, harmonics[:, :size], sums[:, 2:3] / total[:, None], weight)
-            if csi is not None:
+            gain.add(chosen, harmonics[:, :size], sums[:, 2:3] / total[:, None], weight, both=number == 0)
+            if with_csi:
                 power = sums[:, 1]
                 left = sums[:, 3:] / power.clamp_min(1e-6)[:, None] * (power > 1e-6)[:, None]
-                csi.add(index, harmonics[:, :4], left, weight * power / total)
-        gain_sh = gain_sh + gain.solve(cells, ridge)[..., 0]
-        if csi is not None:
-            csi_sh = csi_sh + csi.solve(cells, ridge)
-    return gain_sh, csi_sh
+                csi.add(chosen, harmonics[:, :4], left, weight * power / total, both=number == 0)
+        gain.solve(cells, ridge)
+        if with_csi:
+            csi.solve(cells, ridge)
+    return gain.solution[..., 0], csi.solution
 
 
-def _leftover(surface: Surface, view: RadioView, with_csi: bool, backend: Backend) -> tuple[Tensor, Tensor, Tensor]:
-    """Gaussians in view `[n]`, sums `[n, 3 (+ 4)]` over the pixels that each decides, and directions `[n, 3]`.
+def _leftover(seen: Surface, view: RadioView, with_csi: bool, backend: Backend) -> tuple[Tensor, Tensor]:
+    """Sums `[n, 3 (+ 4)]` over the pixels that each Gaussian `seen` in a view decides, and directions `[n, 3]`.
 
     The sums are of 1, of the target gain, of what the gain lacks, and of what delay and departure lack times the target
     gain: the gradient of `(rendering * those pictures).sum()` in the Gaussians' values.
     """
-    index = in_view(surface.means, reach_of(surface.scales), view.camera)
-    seen = surface.select(index)
     directions = view_directions(seen.means, view.camera.position)
-    values = torch.cat((torch.zeros(len(index), 2), gain_values(seen.gain_sh, directions)), -1)
+    values = torch.cat((torch.zeros(len(seen), 2), gain_values(seen.gain_sh, directions)), -1)
     if with_csi:
         values = torch.cat((values, csi_values(seen, view.camera.position, directions)), -1)
     values.requires_grad_()
@@ -84,38 +85,43 @@ def _leftover(surface: Surface, view: RadioView, with_csi: bool, backend: Backen
         shown = picture[..., 3:] / raster.weight.detach().clamp_min(1e-3)[..., None]
         lacking = torch.cat((lacking, reached[..., None] * (view.csi - shown)), -1)
     (sums,) = torch.autograd.grad(raster.values, values, lacking)
-    return index, sums, directions
+    return sums, directions
 
 
 class _Normal:
-    """Normal equations of every Gaussian: `left` `[N, K, K]` and `right` `[N, K, C]`."""
+    """Normal equations of every Gaussian, `left` `[N, K, K]` and `right` `[N, K, C]`, with `solution` `[N, K, C]`."""
 
     def __init__(self, count: int, size: int, channels: int) -> None:
         self.left = torch.zeros(count, size, size)
         self.right = torch.zeros(count, size, channels)
+        self.solution = torch.zeros(count, size, channels)
 
-    def add(self, index: Tensor, harmonics: Tensor, target: Tensor, weight: Tensor) -> None:
-        """One observation of each Gaussian `index` `[n]`: basis `[n, K]`, target `[n, C]`, weight `[n]`."""
+    def add(self, index: Tensor, harmonics: Tensor, lacking: Tensor, weight: Tensor, *, both: bool) -> None:
+        """One observation of each Gaussian `index` `[n]`: basis `[n, K]`, what is lacking `[n, C]`, weight `[n]`.
+
+        The left side depends on basis and weight alone; without `both` it is taken as added already.
+        """
         weighted = harmonics * weight[:, None]
-        self.left[index] += weighted[:, :, None] * harmonics[:, None, :]
-        self.right[index] += weighted[:, :, None] * target[:, None, :]
+        if both:
+            self.left.index_add_(0, index, weighted[:, :, None] * harmonics[:, None, :])
+        self.right.index_add_(0, index, weighted[:, :, None] * lacking[:, None, :])
 
-    def solve(self, cells: Sequence[Tensor], ridge: float) -> Tensor:
-        """Coefficients `[N, K, C]`, coarse to fine; each level adds a correction that the ridge keeps small."""
+    def solve(self, cells: Sequence[Tensor], ridge: float) -> None:
+        """Add to the solution what is lacking, coarse to fine; the ridge keeps each level's correction small."""
         size = self.left.shape[1]
         band = torch.tensor([degree for degree in range(4) for _ in range(2 * degree + 1)][:size], dtype=torch.float32)
         penalty = torch.diag(ridge * 0.25 * (1.0 + band) ** 2)
         everyone = torch.zeros(len(self.left), dtype=torch.long)
-        solution = torch.zeros_like(self.right)
+        found = torch.zeros_like(self.solution)
         for group in (everyone, *cells, None):
-            left, right = self.left, self.right - self.left @ solution
+            left, right = self.left, self.right - self.left @ found
             if group is not None:
                 groups = int(group.max()) + 1
                 left = left.new_zeros(groups, *left.shape[1:]).index_add_(0, group, left)
                 right = right.new_zeros(groups, *right.shape[1:]).index_add_(0, group, right)
             correction = torch.linalg.solve(left + penalty, right)
-            solution = solution + (correction if group is None else correction[group])
-        return solution
+            found = found + (correction if group is None else correction[group])
+        self.solution = self.solution + found
 
 
 def _cells(surface: Surface, size: float) -> Tensor:

@@ -136,7 +136,8 @@ class RadioStage:
 
     def __init__(self, bare: Surface, views: Sequence[RadioView], config: RadioConfig) -> None:
         self.bare, self.views, self.config = bare, views, config
-        self.reach = reach_of(bare.scales)
+        reach = reach_of(bare.scales)
+        self.visible = [in_view(bare.means, reach, view.camera) for view in views]
         self.has_csi = all(view.csi is not None for view in views)
         gain_sh, csi_sh = self._start()
         values = {
@@ -151,9 +152,8 @@ class RadioStage:
 
     def step(self, iteration: int) -> float:
         """One view: its gain, and in every n-th iteration its delay and departure."""
-        view = self.views[view_at(self.config.seed, iteration, len(self.views))]
-        index = in_view(self.bare.means, self.reach, view.camera)
-        surface = self._surface().select(index)
+        number = view_at(self.config.seed, iteration, len(self.views))
+        view, surface = self.views[number], self._surface().select(self.visible[number])
         directions = view_directions(surface.means, view.camera.position)
         if self.config.encoding == "paper":
             loss = self._paper_loss(surface, view, directions)
@@ -219,7 +219,9 @@ class RadioStage:
             return bare.gain_sh, bare.csi_sh
         degree = config.degree if config.start == "ridge" else 0
         with torch.enable_grad():
-            found, csi = ridge_start(bare, self.views, degree=degree, ridge=config.ridge, backend=config.backend)
+            found, csi = ridge_start(
+                bare, self.views, self.visible, degree=degree, ridge=config.ridge, backend=config.backend
+            )
         gain_sh = torch.zeros_like(bare.gain_sh)
         gain_sh[:, : found.shape[1]] = found
         return gain_sh, csi
