@@ -1,0 +1,38 @@
+"""A synthetic room of flattened Gaussians and a view of it."""
+
+import torch
+from torch import Tensor
+
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import Camera, pinhole_grid
+
+ROOM = (14.0, 15.0, 3.5)  # m
+
+
+def room(count: int, *, channels: int = 3, seed: int = 0) -> dict[str, Tensor]:
+    """`count` Gaussians on the walls of the room, flat against them, their size chosen so that they cover the walls.
+
+    Activated means, quats, scales, opacities and degree-3 harmonics.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    size = torch.tensor(ROOM)
+    means = torch.rand(count, 3, generator=generator) * size
+    area = torch.tensor([ROOM[1] * ROOM[2], ROOM[0] * ROOM[2], ROOM[0] * ROOM[1]])
+    axis = torch.multinomial(area, count, replacement=True, generator=generator)
+    far = torch.randint(0, 2, (count,), generator=generator)
+    index = torch.arange(count)
+    means[index, axis] = far * size[axis]
+    spread = 0.03 * (200_000 / count) ** 0.5
+    scales = spread * torch.exp(0.3 * torch.randn(count, 3, generator=generator))
+    scales[index, axis] = 0.1 * spread
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
+    opacities = 0.1 + 0.88 * torch.rand(count, generator=generator)
+    sh = 0.2 * torch.randn(count, 16, channels, generator=generator)
+    return {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+
+
+def view(width: int = 300, height: int = 200) -> Camera:
+    """A view through the room's length."""
+    return Camera.of(
+        Pose.look_at(position=(2.0, 3.0, 1.5), target=(11.0, 12.0, 1.2)), pinhole_grid(width, height, 90.0)
+    )
