@@ -64,9 +64,13 @@ def read_array(group: h5py.Group, name: str) -> np.ndarray:
 
 def read_attribute(item: h5py.HLObject, name: str) -> str | float | int | np.ndarray:
     """One attribute as text, number or small array; a missing one is a `DataError` that names file and object."""
-    if name not in item.attrs:
+    try:
+        known = name in item.attrs
+        value = item.attrs[name] if known else None
+    except (OSError, RuntimeError, ValueError, TypeError) as error:
+        raise DataError(f"{item.file.filename}: the attribute {name!r} of {item.name!r} is damaged") from error
+    if not known:
         raise DataError(f"{item.file.filename}: {item.name!r} lacks the attribute {name!r}; write the file again")
-    value = item.attrs[name]
     if isinstance(value, bytes):
         return value.decode("utf-8", errors="replace")
     if isinstance(value, str):

@@ -33,6 +33,9 @@ def spectra_faults(path: Path) -> Found:
     except DataError as error:
         yield _sentence(path, error), again
         return
+    except (OSError, ValueError, TypeError, IndexError, KeyError) as error:
+        yield f"the arrays do not fit together ({error})", again
+        return
     try:
         read_spectra(path)
     except DataError as error:
@@ -40,7 +43,7 @@ def spectra_faults(path: Path) -> Found:
 
 
 def _group_faults(group: h5py.Group, name: str) -> Found:
-    positions, orientations = read_array(group, "position"), read_array(group, "orientation")
+    positions, orientations = (read_array(group, key).astype(np.float64) for key in ("position", "orientation"))
     gain, some = _scaled(group, "gain")
     counts = {"position": len(positions), "orientation": len(orientations), "gain": len(gain)}
     if len(set(counts.values())) > 1:
