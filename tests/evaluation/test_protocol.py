@@ -8,6 +8,7 @@ import torch
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import pinhole_grid
 from rf3dgs.evaluation import evaluate, format_table
 from rf3dgs.evaluation.scores import SCORES
 from rf3dgs.spectra.codec import DbWindow
@@ -72,6 +73,16 @@ def test_a_second_solve_of_some_positions_is_put_where_it_belongs(room):
     values = result.column("second solve", "rmse_db")
     assert np.isnan(values[:2]).all()
     assert values[2] == 0.0
+
+
+def test_a_second_solve_finds_its_own_view_among_those_of_one_position(room):
+    grid = pinhole_grid(24, 16, fov_deg=90)
+    views = Pose.from_yaw((6.0, 6, 1.5), torch.arange(4) * (math.pi / 2))
+    test = room.spectra_at(views, grid)
+    result = evaluate(room.Oracle(), test, repeat=test[torch.tensor([3, 1])], window=DbWindow(-120.0, -60.0))
+    values = result.column("second solve", "rmse_db")
+    assert np.isnan(values[[0, 2]]).all()
+    assert (values[[1, 3]] == 0.0).all()
 
 
 def test_the_window_is_the_one_asked_for_else_the_predictors_own(room):

@@ -159,8 +159,8 @@ def _ceiling(
     array: PlanarArray,
     lpips: Lpips | None,
 ) -> dict[str, np.ndarray]:
-    """Values of the second solve, put where its positions stand among the held-out ones; NaN at the others."""
-    distance = torch.cdist(repeat.pose.position.double(), spectra.pose.position.double())
+    """Values of the second solve, put where its poses stand among the held-out ones; NaN at the others."""
+    distance = torch.cdist(_pose_numbers(repeat.pose), _pose_numbers(spectra.pose))
     nearest, index = distance.min(1)
     if bool((nearest > LEAK_DISTANCE).any()) or len(index.unique()) < len(index):
         raise InputError(
@@ -168,6 +168,11 @@ def _ceiling(
         )
     values = score(spectra[index], repeat, covariance[index], window, array, lpips)
     return {name: _scatter(value, index.numpy(), len(spectra)) for name, value in values.items()}
+
+
+def _pose_numbers(pose: Pose) -> Tensor:
+    """Position [m] and rotation matrix of each pose as one row `[n, 12]`, so that equal poses are equal rows."""
+    return torch.cat((pose.position, pose.world_from_device.reshape(-1, 9)), -1).double()
 
 
 def _scatter(value: np.ndarray, index: np.ndarray, count: int) -> np.ndarray:
