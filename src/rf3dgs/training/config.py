@@ -72,8 +72,11 @@ class VisualConfig:
     """Decides the first Gaussians, the order of the photographs and how Gaussians split; the same seed gives the same
     Gaussians, bit by bit, on one machine."""
 
+    start: Literal["sweep", "random"] = "sweep"
+    """How to begin without points: "sweep" finds surface points by comparing the photographs at trial depths and adds
+    a few random Gaussians; "random" is a cloud in the box."""
     start_count: int = 20_000
-    """How many random Gaussians to begin with when there are no points to begin from."""
+    """How many Gaussians to begin with when there are no points to begin from."""
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     """Lowest and highest corner [m] of the box of the first Gaussians; None takes the cameras' box with a margin."""
     max_count: int = 1_000_000

@@ -1,4 +1,4 @@
-"""Where the visual stage begins: the box the scene may fill, and random Gaussians that cameras can see."""
+"""Where the visual stage begins: the box the scene may fill, and Gaussians in it, swept or random."""
 
 from collections.abc import Sequence
 
@@ -7,9 +7,14 @@ from torch import Tensor
 
 from rf3dgs.core.grids import Camera
 from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.training.loop import random_at
+from rf3dgs.training.sweep import swept_points
 
 BOX_MARGIN = 0.25
 SMALLEST_EXTENT = 0.1
+SWEPT_SHARE = 0.85
+SWEPT_OPACITY = 0.3
+LEAST_SWEPT = 100
 
 
 def camera_box(cameras: Sequence[Camera]) -> tuple[list[float], list[float]]:
@@ -45,3 +50,29 @@ def random_start(
     drawn = Gaussians.random(int(count / max(share, 0.05)), low, high, degree=degree, seed=seed + 1)
     kept = torch.nonzero(views_of(drawn.means, cameras) >= needed).flatten()[:count]
     return drawn.subset(kept) if len(kept) else drawn.subset(torch.arange(min(count, len(drawn))))
+
+
+def swept_start(
+    cameras: Sequence[Camera],
+    pictures: Sequence[Tensor],
+    count: int,
+    low: Sequence[float],
+    high: Sequence[float],
+    *,
+    degree: int,
+    seed: int,
+) -> Gaussians:
+    """At most `count` Gaussians: 85 % on surfaces that a plane sweep finds in the box [m], the others random in it.
+
+    `pictures` are bytes `[row, col, 3]`. Where the sweep finds fewer than a hundred points, all are random.
+    """
+    box = torch.tensor([list(low), list(high)], dtype=torch.float32)
+    corners = torch.stack([(camera.position - box).abs().amax(0) for camera in cameras])
+    far = float(torch.linalg.vector_norm(corners, dim=-1).max())
+    points, colours = swept_points(cameras, pictures, far, int(SWEPT_SHARE * count), random_at(seed, 0, "sweep"))
+    inside = ((points > box[0]) & (points < box[1])).all(-1)
+    if int(inside.sum()) < LEAST_SWEPT:
+        return random_start(cameras, count, low, high, degree=degree, seed=seed)
+    swept = Gaussians.from_points(points[inside], colours[inside], degree=degree, opacity=SWEPT_OPACITY)
+    others = max(1, int((1 - SWEPT_SHARE) * count))
+    return Gaussians.join([swept, random_start(cameras, others, low, high, degree=degree, seed=seed)])

@@ -23,11 +23,12 @@ from rf3dgs.splats.rasterize import rasterize
 from rf3dgs.training.adam import Adam
 from rf3dgs.training.checkpoint import State, fingerprint
 from rf3dgs.training.config import VisualConfig
-from rf3dgs.training.initial import camera_box, random_start
+from rf3dgs.training.initial import camera_box, random_start, swept_start
 from rf3dgs.training.loop import random_at, train, view_at
 from rf3dgs.training.photographs import blending_weights, colour_towards, picture_of, shrunk
 from rf3dgs.training.schedule import Schedule
 
+TRAINED = ("means", "quats", "log_scales", "logit_opacities", "level", "bands")
 HIGHER_BANDS_SLOWER = 20.0
 
 
@@ -74,15 +75,23 @@ class VisualStage:
         self.cameras = [photo.camera for photo in photos]
         self.pictures = [picture_of(photo) for photo in photos]
         self.extent = scene_extent(torch.stack([camera.position for camera in self.cameras]))
-        start = self._start(initial)
+        self.initial = initial
+        first = initial.tensors().values() if isinstance(initial, Gaussians) else [] if initial is None else [initial]
         data = [*self.pictures, *(t for camera in self.cameras for t in (camera.viewmat, camera.K))]
         self.identity = {
             "stage": "visual",
             "configuration": dataclasses.asdict(config),
             "photographs": fingerprint(data),
-            "first Gaussians": fingerprint(start.tensors().values()),
+            "first Gaussians": fingerprint(first),
         }
-        self.degree = min(start.degree, config.degree) if isinstance(initial, Gaussians) else 0
+        self.degree = min(initial.degree, config.degree) if isinstance(initial, Gaussians) else 0
+        self.parameters: dict[str, Tensor] = {}
+        self.adam = Adam({})
+        self.density = DensityState(0)
+
+    def begin(self) -> None:
+        """Make the first Gaussians; a run that goes on from a checkpoint needs none."""
+        start = self._start(self.initial)
         self.parameters = _leaves(start, self.degree)
         self.adam = Adam(self.parameters)
         self.density = DensityState(len(start))
@@ -95,10 +104,15 @@ class VisualStage:
             initial.check()
             return initial
         low, high = self.config.bounds or camera_box(self.cameras)
-        return random_start(self.cameras, self.config.start_count, low, high, degree=degree, seed=self.config.seed)
+        count, seed = self.config.start_count, self.config.seed
+        if self.config.start == "random":
+            return random_start(self.cameras, count, low, high, degree=degree, seed=seed)
+        return swept_start(self.cameras, self.pictures, count, low, high, degree=degree, seed=seed)
 
     def gaussians(self) -> Gaussians:
         """The present Gaussians, with all harmonics that the configuration asks for."""
+        if not self.parameters:
+            self.begin()
         tensors = {name: tensor.detach() for name, tensor in self.parameters.items()}
         level, bands = tensors.pop("level"), tensors.pop("bands")
         missing = coefficient_count(self.config.degree) - 1 - bands.shape[1]
@@ -106,7 +120,10 @@ class VisualStage:
 
     def step(self, iteration: int) -> float:
         """One photograph, one update, and what the schedule asks for after it; returns the loss."""
-        config, schedule, now = self.config, self.schedule, self.parameters
+        config, schedule = self.config, self.schedule
+        if not self.parameters:
+            self.begin()
+        now = self.parameters
         if schedule.degree_at(iteration) > self.degree:
             self._raise_degree(schedule.degree_at(iteration))
             now = self.parameters
@@ -207,7 +224,7 @@ class VisualStage:
                 name.removeprefix(prefix): value for name, value in state.tensors.items() if name.startswith(prefix)
             }
 
-        self.parameters = {name: state.tensors[name].requires_grad_() for name in self.parameters}
+        self.parameters = {name: state.tensors[name].requires_grad_() for name in TRAINED}
         self.adam = Adam(self.parameters)
         self.adam.first, self.adam.second = group("first."), group("second.")
         self.adam.count = int(str(state.numbers["adam_steps"]))
