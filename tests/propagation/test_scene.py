@@ -76,7 +76,7 @@ def test_free_and_occupant_know_inside_from_outside(site):
 
 
 def test_too_much_clearance_is_refused(site):
-    with pytest.raises(InputError, match="no room for 10 positions with 4.0 m clearance"):
+    with pytest.raises(InputError, match=r"no room for 10 positions with 4.0 m clearance"):
         site.receivers(10, seed=0, clearance=4.0)
 
 
@@ -110,9 +110,9 @@ def test_the_large_surfaces_are_textured(site):
 def test_an_unknown_material_is_named(site, tmp_path):
     bad = replace(site["floor"], material="velvet")
     scene = replace(site, objects=(bad,))
-    with pytest.raises(InputError, match="object 'floor' has the material 'velvet'.*60 GHz; use one of concrete"):
+    with pytest.raises(InputError, match=r"object 'floor' has the material 'velvet'.*60 GHz; use one of concrete"):
         write_radio_scene(scene, tmp_path)
-    with pytest.raises(InputError, match="'brick', which ITU-R P.2040 does not define at 60 GHz"):
+    with pytest.raises(InputError, match=r"'brick', which ITU-R P.2040 does not define at 60 GHz"):
         permittivity("brick", 60e9)
     assert not list(tmp_path.iterdir())
 
@@ -123,7 +123,9 @@ def test_materials_equal_sionnas_own_table(tracer):
 
     for name, material in ITU.items():
         frequency = 28e9 if material.high_ghz >= 28 and material.low_ghz <= 28 else 60e9
-        assert permittivity(name, frequency) == pytest.approx([float(np.array(v).item()) for v in itu_material(name, frequency)], rel=1e-4)
+        assert permittivity(name, frequency) == pytest.approx(
+            [float(np.array(v).item()) for v in itu_material(name, frequency)], rel=1e-4
+        )
 
 
 @pytest.mark.parametrize(

@@ -167,7 +167,7 @@ def test_bad_arguments_are_refused(site):
     rx = Pose([[3.0, 3.0, 1.5]])
     with pytest.raises(InputError, match="frequency must be in hertz"):
         sionna.trace_each(site, None, rx, QUICK, frequency=60.0)
-    with pytest.raises(InputError, match="'floorboard', which ITU-R P.2040 does not define at 28 GHz"):
+    with pytest.raises(InputError, match=r"'floorboard', which ITU-R P.2040 does not define at 28 GHz"):
         sionna.trace_each(site, None, rx, QUICK, frequency=28e9)
     with pytest.raises(InputError, match="rays and passes must be positive"):
         sionna.trace_each(site, None, rx, replace(QUICK, rays=0))
@@ -176,7 +176,9 @@ def test_bad_arguments_are_refused(site):
 
 
 def test_unknown_scenes_are_refused(tracer):
-    with pytest.raises(InputError, match="no scene is named 'atlantis'; use lobby, an .xml file, or one of Sionna's: box"):
+    with pytest.raises(
+        InputError, match=r"no scene is named 'atlantis'; use lobby, an .xml file, or one of Sionna's: box"
+    ):
         scene_of("atlantis")
 
 
@@ -202,10 +204,22 @@ def plain(inner: str) -> str:
     ("text", "message"),
     [
         (plain('<include filename="/etc/passwd"/>'), "has a <include> element"),
-        (plain('<shape type="ply"><string name="filename" value="/etc/passwd"/></shape>'), "only files in the scene's own"),
-        (plain('<shape type="ply"><string name="filename" value="../a.ply"/></shape>'), "only files in the scene's own"),
-        (plain('<shape type="ply"><string name="filename" value="C:\\a.ply"/></shape>'), "only files in the scene's own"),
-        (plain('<shape type="ply"><string name="filename" value="link/a.ply"/></shape>'), "only files in the scene's own"),
+        (
+            plain('<shape type="ply"><string name="filename" value="/etc/passwd"/></shape>'),
+            "only files in the scene's own",
+        ),
+        (
+            plain('<shape type="ply"><string name="filename" value="../a.ply"/></shape>'),
+            "only files in the scene's own",
+        ),
+        (
+            plain('<shape type="ply"><string name="filename" value="C:\\a.ply"/></shape>'),
+            "only files in the scene's own",
+        ),
+        (
+            plain('<shape type="ply"><string name="filename" value="link/a.ply"/></shape>'),
+            "only files in the scene's own",
+        ),
         (plain('<shape type="ply"><string name="filename" value="no.ply"/></shape>'), "does not exist beside it"),
         (plain('<path value="/etc"/>'), "has a <path> element"),
         ('<!DOCTYPE scene [<!ENTITY a "b">]><scene version="2.1.0"/>', "declares a document type"),
@@ -225,5 +239,3 @@ def test_unsafe_scene_files_are_refused(tmp_path, text, message):
 def test_missing_scene_files_are_data_errors(tmp_path):
     with pytest.raises(DataError, match=r"cannot read the scene .*nowhere.xml"):
         scene_of(tmp_path / "nowhere.xml")
-
-

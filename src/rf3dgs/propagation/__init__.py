@@ -30,5 +30,5 @@ _HOMES = {
     "render_photos": ".photographer",
     "find_llvm": ".llvm",
 }
-__all__ = list(_HOMES)
+__all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -12,7 +12,7 @@ class TraceConfig:
     rays: int = 300_000
     """Rays shot from the transmitter; below 300,000 the rays' lattice shows as dots near the receiver."""
     passes: int = 1
-    """Solves per receiver, each with another lattice of rays, whose diffuse powers are averaged: detail at flat memory."""
+    """Solves per receiver with different lattices of rays, whose diffuse powers are averaged: more detail."""
     seed: int = 0
     """Receiver number i is traced with the seed `seed + i`."""
     frequency: float | None = None

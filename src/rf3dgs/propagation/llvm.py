@@ -8,10 +8,12 @@ import os
 import re
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple
 
 from rf3dgs.core.errors import MissingDependencyError
@@ -101,9 +103,19 @@ def mitsuba_variant(name: str) -> Iterator[None]:
     import mitsuba
 
     before = mitsuba.variant()
-    mitsuba.set_variant(name)
+    if before != name:
+        _switch(mitsuba, name)
     try:
         yield
     finally:
         if before is not None and before != name:
-            mitsuba.set_variant(before)
+            _switch(mitsuba, before)
+
+
+def _switch(mitsuba: ModuleType, name: str) -> None:
+    """Change the variant; Sionna then compiles one of its modules anew, and Dr.Jit warns when that adds up."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", message="The AST-transforming decorator @drjit.syntax", category=RuntimeWarning
+        )
+        mitsuba.set_variant(name)

@@ -38,7 +38,7 @@ THICKNESS = {
 
 
 def lobby() -> Scene:
-    """The lobby: origin in the south-west corner of its floor, x east, y north, z up; transmitter high in that corner."""
+    """The lobby: origin in the floor's south-west corner, x east, y north, z up; transmitter high in that corner."""
     objects = [*_shell(), *_openings(), *_lights(), *_columns(), *_furniture(), *_plants(), *_signs()]
     return Scene(
         name="lobby",
@@ -56,7 +56,7 @@ def _object(
     name: str,
     mesh: Mesh,
     material: str,
-    picture: NDArray[np.float64],
+    picture: NDArray[np.floating],
     size: Sequence[float],
     *,
     solid: bool = False,
@@ -90,13 +90,17 @@ def _shell() -> list[SceneObject]:
     floor = paint.tiles(
         WIDTH, LENGTH, ((0.50, 0.46, 0.40), (0.74, 0.70, 0.63)), (0.6, 0.6), 1, joint=(0.30, 0.28, 0.26), gap=0.02
     )
-    rug = paint.tiles(4.0, 3.0, ((0.50, 0.14, 0.14), (0.68, 0.24, 0.16)), (0.5, 0.5), 2, joint=(0.85, 0.72, 0.45), gap=0.03)
+    rug = paint.tiles(
+        4.0, 3.0, ((0.50, 0.14, 0.14), (0.68, 0.24, 0.16)), (0.5, 0.5), 2, joint=(0.85, 0.72, 0.45), gap=0.03
+    )
     density = paint.DENSITY
     row, col = round(6.6 * density), round(5.2 * density)
     floor[row : row + rug.shape[0], col : col + rug.shape[1]] = rug
     board = (0.94, 0.94, 0.91)
-    ceiling = paint.tiles(WIDTH, LENGTH, ((0.84, 0.85, 0.82), board), (0.6, 0.6), 3, joint=(0.55, 0.56, 0.56), gap=0.016)
-    ceiling *= 1 + 0.05 * paint.noise(*ceiling.shape[:2], 4, coarse=60)[..., None]
+    ceiling = paint.tiles(
+        WIDTH, LENGTH, ((0.84, 0.85, 0.82), board), (0.6, 0.6), 3, joint=(0.55, 0.56, 0.56), gap=0.016
+    )
+    ceiling *= 1 + 0.05 * paint.noise(ceiling.shape[0], ceiling.shape[1], 4, coarse=60)[..., None]
     south = paint.tiles(
         WIDTH, HEIGHT, ((0.80, 0.72, 0.52), (0.90, 0.84, 0.68)), (1.0, 0.7), 5, joint=(0.55, 0.46, 0.32), gap=0.015
     )
@@ -116,10 +120,26 @@ def _shell() -> list[SceneObject]:
         paint.poster(north, WIDTH, left, 0.7, (1.9, 1.5), 40 + index)
     return [
         _object("floor", quad((0, LENGTH, 0), (WIDTH, 0, 0), (0, -LENGTH, 0)), "floorboard", floor, (WIDTH, LENGTH)),
-        _object("ceiling", quad((0, 0, HEIGHT), (WIDTH, 0, 0), (0, LENGTH, 0)), "ceiling_board", ceiling, (WIDTH, LENGTH)),
-        _object("wall-south", wall((WIDTH, 0, HEIGHT), (-WIDTH, 0, 0), HEIGHT, [ENTRANCE]), "plasterboard", south, (WIDTH, HEIGHT)),
-        _object("wall-west", wall((0, 0, HEIGHT), (0, LENGTH, 0), HEIGHT, WINDOWS), "plasterboard", west, (LENGTH, HEIGHT)),
-        _object("wall-east", wall((WIDTH, LENGTH, HEIGHT), (0, -LENGTH, 0), HEIGHT, DOORS), "concrete", east, (LENGTH, HEIGHT)),
+        _object(
+            "ceiling", quad((0, 0, HEIGHT), (WIDTH, 0, 0), (0, LENGTH, 0)), "ceiling_board", ceiling, (WIDTH, LENGTH)
+        ),
+        _object(
+            "wall-south",
+            wall((WIDTH, 0, HEIGHT), (-WIDTH, 0, 0), HEIGHT, [ENTRANCE]),
+            "plasterboard",
+            south,
+            (WIDTH, HEIGHT),
+        ),
+        _object(
+            "wall-west", wall((0, 0, HEIGHT), (0, LENGTH, 0), HEIGHT, WINDOWS), "plasterboard", west, (LENGTH, HEIGHT)
+        ),
+        _object(
+            "wall-east",
+            wall((WIDTH, LENGTH, HEIGHT), (0, -LENGTH, 0), HEIGHT, DOORS),
+            "concrete",
+            east,
+            (LENGTH, HEIGHT),
+        ),
         _object("wall-north", wall((0, LENGTH, HEIGHT), (WIDTH, 0, 0), HEIGHT, LIFTS), "wood", north, (WIDTH, HEIGHT)),
     ]
 
@@ -138,7 +158,9 @@ def _openings() -> list[SceneObject]:
     for number, (left, right, foot, head) in enumerate(DOORS, 1):
         size = (right - left, head - foot)
         mesh = quad((WIDTH, LENGTH - left, head), (0, -size[0], 0), (0, 0, -size[1]))
-        objects.append(_object(f"door-{number}", mesh, "wood", paint.door(*size, (0.55, 0.36, 0.20), 62 + number), size))
+        objects.append(
+            _object(f"door-{number}", mesh, "wood", paint.door(*size, (0.55, 0.36, 0.20), 62 + number), size)
+        )
     for number, (left, right, foot, head) in enumerate(LIFTS, 1):
         size = (right - left, head - foot)
         mesh = quad((left, LENGTH, head), (size[0], 0, 0), (0, 0, -size[1]))
@@ -160,7 +182,9 @@ def _lights() -> list[SceneObject]:
 def _columns() -> list[SceneObject]:
     """Two square columns and two round ones (of sixteen faces)."""
     stone = paint.tiles(2.4, HEIGHT, ((0.58, 0.60, 0.58), (0.78, 0.80, 0.76)), (0.6, 0.5), 80, joint=(0.36, 0.38, 0.38))
-    bands = paint.tiles(2.4, HEIGHT, ((0.20, 0.42, 0.44), (0.46, 0.66, 0.60)), (0.3, 0.35), 82, joint=(0.86, 0.84, 0.74))
+    bands = paint.tiles(
+        2.4, HEIGHT, ((0.20, 0.42, 0.44), (0.46, 0.66, 0.60)), (0.3, 0.35), 82, joint=(0.86, 0.84, 0.74)
+    )
     objects = []
     for number, (x, y) in enumerate(((4.5, 4.6), (9.5, 10.4)), 1):
         mesh = box((x - 0.3, y - 0.3, 0), (x + 0.3, y + 0.3, HEIGHT))
@@ -189,7 +213,9 @@ def _furniture() -> list[SceneObject]:
         back = x - 0.3 if number < 3 else x + 0.2
         parts.append(box((back, y - 1.0, 0.46), (back + 0.1, y + 1.0, 0.95)))
         objects.append(_object(f"bench-{number}", join(parts), "wood", seat, (1.0, 1.0), solid=True))
-    for number, (low, size) in enumerate((((12.3, 1.0, 0.0), 0.9), ((12.5, 2.2, 0.0), 0.7), ((12.4, 1.1, 0.9), 0.6)), 1):
+    for number, (low, size) in enumerate(
+        (((12.3, 1.0, 0.0), 0.9), ((12.5, 2.2, 0.0), 0.7), ((12.4, 1.1, 0.9), 0.6)), 1
+    ):
         high = tuple(value + size for value in low)
         objects.append(_object(f"crate-{number}", box(low, high), "chipboard", crate, (1.0, 1.0), solid=True))
     objects += [
@@ -204,11 +230,20 @@ def _furniture() -> list[SceneObject]:
 def _plants() -> list[SceneObject]:
     """Potted plants, the foliage as ellipsoids of facets."""
     pot = paint.tiles(1.2, 0.5, ((0.62, 0.34, 0.22), (0.76, 0.46, 0.30)), (0.2, 0.25), 100, joint=(0.42, 0.22, 0.14))
-    leaf = paint.tiles(0.8, 0.8, ((0.12, 0.30, 0.10), (0.38, 0.58, 0.22)), (0.1, 0.08), 101, joint=(0.08, 0.20, 0.06), shift=0.5)
+    leaf = paint.tiles(
+        0.8, 0.8, ((0.12, 0.30, 0.10), (0.38, 0.58, 0.22)), (0.1, 0.08), 101, joint=(0.08, 0.20, 0.06), shift=0.5
+    )
     objects = []
     for number, (x, y) in enumerate(((13.3, 14.3), (0.8, 14.2), (4.4, 0.7), (9.9, 0.8)), 1):
         objects.append(
-            _object(f"pot-{number}", prism((x, y), 0.24, 0.0, 0.5, 8, top_radius=0.32), "concrete", pot, (1.2, 0.5), solid=True)
+            _object(
+                f"pot-{number}",
+                prism((x, y), 0.24, 0.0, 0.5, 8, top_radius=0.32),
+                "concrete",
+                pot,
+                (1.2, 0.5),
+                solid=True,
+            )
         )
         foliage = ball((x, y, 1.05), (0.42, 0.42, 0.56))
         objects.append(_object(f"plant-{number}", foliage, "wood", leaf, (0.8, 0.8), solid=True, scattering=0.97))

@@ -61,7 +61,7 @@ def _winding(points: Tensor, corners: Tensor) -> Tensor:
 
 
 def coloured(item: "SceneObject", longest_edge: float | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Vertices `[V, 3]`, faces `[F, 3]` and each face's sRGB colour `[F, 3]`, cut until no edge exceeds `longest_edge`."""
+    """Vertices `[V, 3]`, faces `[F, 3]` and their sRGB colours `[F, 3]`, cut until no edge exceeds `longest_edge`."""
     uv = torch.zeros(len(item.vertices), 2) if item.uv is None else item.uv
     points = torch.cat((item.vertices, uv), -1)
     triangles = points[item.faces]

@@ -66,14 +66,11 @@ def render_photos(
     except ImportError as error:
         raise MissingDependencyError("photographs need Mitsuba: pip install 'rf3dgs[trace]'") from error
     variant = "llvm_ad_rgb" if find_llvm().path is not None else "scalar_rgb"
-    with tempfile.TemporaryDirectory(prefix="rf3dgs-") as folder:
-        path = write_visual_scene(scene, Path(folder))
-        with mitsuba_variant(variant):
-            loaded = mitsuba.load_file(str(path), optimize=False)
+    with tempfile.TemporaryDirectory(prefix="rf3dgs-") as folder, mitsuba_variant(variant):
+        loaded = mitsuba.load_file(str(write_visual_scene(scene, Path(folder))), optimize=False)
         progress.start("photographs", len(cameras))
         for number, camera in enumerate(cameras):
-            with mitsuba_variant(variant):
-                picture = _render(mitsuba, loaded, camera, config, config.seed + number)
+            picture = _render(mitsuba, loaded, camera, config, config.seed + number)
             yield np.round(255.0 * srgb_from_linear(config.exposure * scene.exposure * picture)).astype(np.uint8)
             progress.update(number + 1)
         progress.finish()

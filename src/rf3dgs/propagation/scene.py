@@ -17,14 +17,15 @@ from rf3dgs.propagation.materials import permittivity
 
 Bounds = tuple[Sequence[float], Sequence[float]]
 
+
 @dataclass(frozen=True, eq=False)
 class SceneObject:
     """One object: a triangle mesh with a radio material and a look.
 
     vertices `[V, 3]` [m], faces `[F, 3]` with normals towards free space; uv `[V, 2]` texture coordinates, v downwards
         from the picture's top row, repeated outside [0, 1].
-    material: a name of `materials.ITU`; scattering: amplitude S in [0, 1], so that S^2 of the reflected power is diffuse;
-        thickness [m].
+    material: a name of `materials.ITU`; scattering: amplitude S in [0, 1], so that S^2 of the reflected power is
+        diffuse; thickness [m].
     texture `[row, col, 3]` sRGB bytes, or None for the plain sRGB `colour`. glow: emitted light relative to white.
     solid: closed, and nobody can stand inside.
     """
@@ -144,7 +145,7 @@ class Scene:
             if len(found) >= count:
                 return found[:count]
         raise InputError(
-            f"scene {self.name!r} has no room for {count} positions with {clearance} m clearance; ask for less clearance"
+            f"scene {self.name!r} has no room for {count} positions with {clearance} m clearance; ask for less"
         )
 
     def check_radio(self, frequency: float) -> None:

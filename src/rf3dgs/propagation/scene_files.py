@@ -19,8 +19,8 @@ LARGEST_XML = 16 * 2**20  # bytes
 def write_radio_scene(scene: Scene, folder: str | Path, *, frequency: float | None = None) -> Path:
     """Write `radio.xml` (Sionna RT) and `meshes/*.ply`; returns the XML's path.
 
-    Materials are written with their permittivity and conductivity at `frequency` [Hz] (the scene's when absent), because
-    Sionna loads scenes at 3.5 GHz, where some of them are not defined by name.
+    Materials are written with their permittivity and conductivity at `frequency` [Hz] (the scene's when absent),
+    because Sionna loads scenes at 3.5 GHz, where some of them are not defined by name.
     """
     folder = Path(folder)
     frequency = scene.frequency if frequency is None else frequency
@@ -57,7 +57,7 @@ def write_visual_scene(scene: Scene, folder: str | Path) -> Path:
         lamp = ET.SubElement(root, "emitter", type="point")
         (x0, y0, z0), (x1, y1, z1) = scene.bounds
         position = [f"{value:.4f}" for value in ((x0 + x1) / 2, (y0 + y1) / 2, z0 + 0.9 * (z1 - z0))]
-        ET.SubElement(lamp, "point", name="position", **dict(zip("xyz", position, strict=True)))
+        ET.SubElement(lamp, "point", {"name": "position", **dict(zip("xyz", position, strict=True))})
         _value(lamp, "rgb", "intensity", str(round(0.3 * scene.size**2, 4)))
     for item in scene.objects:
         shape = _shape(root, item, folder)

@@ -6,6 +6,7 @@ texture divides them by its size.
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -51,7 +52,9 @@ def box(low: Vector, high: Vector) -> Mesh:
     )
 
 
-def prism(centre: Vector, radius: float, low: float, high: float, sides: int, *, top_radius: float | None = None) -> Mesh:
+def prism(
+    centre: Vector, radius: float, low: float, high: float, sides: int, *, top_radius: float | None = None
+) -> Mesh:
     """A closed upright prism (a frustum when `top_radius` differs) of `sides` faces around `centre` (x, y)."""
     top = radius if top_radius is None else top_radius
     height = high - low
@@ -63,7 +66,9 @@ def prism(centre: Vector, radius: float, low: float, high: float, sides: int, *,
     meshes = []
     edge = 2 * radius * math.sin(math.pi / sides)
     for i in range(sides):
-        corners = torch.tensor([ring(i, top, high), ring(i + 1, top, high), ring(i + 1, radius, low), ring(i, radius, low)])
+        corners = torch.tensor(
+            [ring(i, top, high), ring(i + 1, top, high), ring(i + 1, radius, low), ring(i, radius, low)]
+        )
         u = torch.tensor([[i * edge, 0], [(i + 1) * edge, 0], [(i + 1) * edge, height], [i * edge, height]])
         meshes.append((corners, torch.tensor([[0, 2, 1], [0, 3, 2]]), u))
     for z, r, order in ((high, top, (0, 1, 2)), (low, radius, (0, 2, 1))):
@@ -96,7 +101,9 @@ def ball(centre: Vector, radii: Vector, *, around: int = 10, rows: int = 6) -> M
     return torch.tensor(vertices, dtype=torch.float32), torch.tensor(faces), torch.tensor(uv, dtype=torch.float32)
 
 
-def wall(corner: Vector, along: Vector, height: float, openings: Sequence[tuple[float, float, float, float]] = ()) -> Mesh:
+def wall(
+    corner: Vector, along: Vector, height: float, openings: Sequence[tuple[float, float, float, float]] = ()
+) -> Mesh:
     """An upright wall seen from inside, from its top left `corner`, with rectangular holes.
 
     `along` is the unit direction times the length [m]; each opening is (left, right, bottom, top) in metres along the
@@ -108,7 +115,7 @@ def wall(corner: Vector, along: Vector, height: float, openings: Sequence[tuple[
     top = torch.tensor(corner, dtype=torch.float64)
     columns = sorted({0.0, length, *(edge for opening in openings for edge in opening[:2])})
     meshes = []
-    for left, right in zip(columns[:-1], columns[1:], strict=True):
+    for left, right in pairwise(columns):
         middle = (left + right) / 2
         holes = sorted((o[2], o[3]) for o in openings if o[0] <= middle <= o[1])
         foot = 0.0

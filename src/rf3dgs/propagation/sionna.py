@@ -62,7 +62,7 @@ def trace_each(
     """Yield all paths `[1, path]` to one receiver after the other, sorted by delay, then by angles.
 
     Receiver i uses the seed `config.seed + i`, or `config.seed + indices[i]` when `rx` is part of a longer list, so
-    that a run may be cut in pieces. The same arguments give the same bits. A receiver that nothing reaches has zero paths.
+    that a run may be cut in pieces. The same arguments give the same bits. What nothing reaches has zero paths.
     Raises InputError for a receiver outside the scene, inside an object or at the transmitter, and for materials that
     are not defined at the frequency; MissingDependencyError without sionna-rt or LLVM.
     """
@@ -162,7 +162,8 @@ class Tracer:
         valid = np.array(found.valid)[0, 0]
         if len(valid) >= room:
             raise RfError(f"the tracer's room for {room} paths is full, so paths may be missing; use fewer rays")
-        kinds = np.array(found.interactions).reshape(-1, len(valid))
+        kinds = np.array(found.interactions)
+        kinds = kinds.reshape(kinds.shape[0], len(valid))
         order = (kinds > 0).sum(0)
         kind = np.bitwise_or.reduce(kinds, axis=0) if len(kinds) else np.zeros_like(order)
         scattered = (kind & DIFFUSE) > 0
@@ -212,7 +213,10 @@ def _check(scene: Scene, tx: Pose, rx: Pose, config: TraceConfig, frequency: flo
         raise InputError(f"frequency must be in hertz, between 100 MHz and 1 THz; got {frequency:g}")
     if scene.source is None:
         scene.check_radio(frequency)
-    for label, position in [("the transmitter", tx.position), *((f"receiver {i}", p) for i, p in enumerate(rx.position))]:
+    for label, position in [
+        ("the transmitter", tx.position),
+        *((f"receiver {i}", p) for i, p in enumerate(rx.position)),
+    ]:
         place = "(" + ", ".join(f"{value:g}" for value in position.tolist()) + ")"
         occupant = scene.occupant(position)
         if occupant == "outside":

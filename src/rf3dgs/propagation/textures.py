@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-Pixels = NDArray[np.float64]
+Pixels = NDArray[np.floating]
 Colour = Sequence[float]
 DENSITY = 48
 """Pixels per metre."""
@@ -37,9 +37,13 @@ def noise(rows: int, cols: int, seed: int, *, coarse: float = 24.0, octaves: int
 
 def _coordinates(width: float, height: float) -> tuple[Pixels, Pixels]:
     rows, cols = max(round(height * DENSITY), 2), max(round(width * DENSITY), 2)
-    x = (np.arange(cols) + 0.5) * (width / cols)
-    y = (np.arange(rows) + 0.5) * (height / rows)
+    x = (np.arange(cols, dtype=np.float64) + 0.5) * (width / cols)
+    y = (np.arange(rows, dtype=np.float64) + 0.5) * (height / rows)
     return np.broadcast_to(x, (rows, cols)), np.broadcast_to(y[:, None], (rows, cols))
+
+
+def _shape(x: Pixels) -> tuple[int, int]:
+    return x.shape[0], x.shape[1]
 
 
 def _paint(colour: Colour, shape: tuple[int, ...]) -> Pixels:
@@ -49,7 +53,7 @@ def _paint(colour: Colour, shape: tuple[int, ...]) -> Pixels:
 def speckled(width: float, height: float, colour: Colour, seed: int, *, strength: float = 0.08) -> Pixels:
     """Plaster, stone or fabric: one colour with blobs from a few centimetres to half a metre."""
     x, _ = _coordinates(width, height)
-    return _paint(colour, x.shape) * (1 + strength * noise(*x.shape, seed)[..., None])
+    return _paint(colour, x.shape) * (1 + strength * noise(*_shape(x), seed)[..., None])
 
 
 def _cells(x: Pixels, y: Pixels, cell: tuple[float, float], seed: int, *, shift: float = 0.0) -> tuple[Pixels, Pixels]:
@@ -80,7 +84,7 @@ def tiles(
     shade, edge = _cells(x, y, cell, seed, shift=shift)
     first, second = np.array(colours[0]), np.array(colours[-1])
     picture = first + (second - first) * shade[..., None]
-    picture = picture * (1 + strength * noise(*x.shape, seed + 1, coarse=10)[..., None])
+    picture = picture * (1 + strength * noise(*_shape(x), seed + 1, coarse=10)[..., None])
     return np.where((edge < gap)[..., None], np.array(joint), picture)
 
 
@@ -94,7 +98,7 @@ def grain(width: float, height: float, colour: Colour, seed: int) -> Pixels:
 
 
 def poster(picture: Pixels, width: float, left: float, top: float, size: tuple[float, float], seed: int) -> None:
-    """Hang a poster of coloured shapes on a wall's picture (changed in place); positions and sizes [m] from top left."""
+    """Hang a poster of coloured shapes on a wall's picture (changed in place); measures in [m] from the top left."""
     density = picture.shape[1] / width
     generator = np.random.default_rng(seed)
     x0, y0 = round(left * density), round(top * density)
@@ -135,7 +139,7 @@ def outdoors(width: float, height: float, seed: int) -> Pixels:
     x, y = _coordinates(width, height)
     v = y / height
     sky = np.array([0.62, 0.78, 0.95]) + (np.array([0.92, 0.95, 0.98]) - np.array([0.62, 0.78, 0.95])) * v[..., None]
-    picture = sky * (1 + 0.03 * noise(*x.shape, seed, coarse=30)[..., None])
+    picture = sky * (1 + 0.03 * noise(*_shape(x), seed, coarse=30)[..., None])
     generator = np.random.default_rng(seed + 1)
     at = 0.0
     while at < width:
@@ -146,7 +150,7 @@ def outdoors(width: float, height: float, seed: int) -> Pixels:
         picture[inside] = colour
         picture[inside & panes] = 0.55 * colour
         at += broad
-    trees = v > 0.82 + 0.03 * noise(*x.shape, seed + 2, coarse=14)
+    trees = v > 0.82 + 0.03 * noise(*_shape(x), seed + 2, coarse=14)
     picture[trees] = np.array([0.25, 0.42, 0.20])
     bars = (np.minimum(x, width - x) < 0.05) | (np.minimum(y, height - y) < 0.05) | (np.abs(x - width / 2) < 0.03)
     picture[bars] = np.array([0.25, 0.26, 0.28])
