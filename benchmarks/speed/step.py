@@ -2,9 +2,9 @@
 
     python -m benchmarks.speed.step [--gaussians 2000] [--width 96] [--height 64] [--json FILE]
 
-A step is: harmonics, forward, L1 + D-SSIM, backward, Adam. Both run on one thread unless told otherwise, and CPU time is
-compared (the median of the repetitions), so that a machine shared with others gives the same answer. Exits with 1 when
-the native step is not at least 20 times faster.
+A step is: harmonics, forward, L1 + D-SSIM, backward, Adam. Both run on one thread unless told otherwise, and CPU time
+is compared (the median of the repetitions), so that a machine shared with others gives the same answer. Exits with 1
+when the native step is not at least 20 times faster.
 """
 
 import argparse

@@ -7,7 +7,7 @@
 #include <cstdint>
 #include <cstring>
 
-#if defined(__AVX2__)
+#if defined(__x86_64__)
 #include <immintrin.h>
 #endif
 
@@ -16,8 +16,112 @@ namespace {
 #define RF_INLINE inline __attribute__((always_inline))
 
 constexpr int kLanes = 16;
+
+#if defined(__AVX512F__)
+
 typedef float Vec __attribute__((vector_size(64)));
 typedef int32_t IntVec __attribute__((vector_size(64)));
+
+RF_INLINE Vec select(IntVec mask, Vec yes, Vec no) { return mask ? yes : no; }
+RF_INLINE IntVec int_bits(Vec value) { return (IntVec)value; }
+RF_INLINE Vec float_bits(IntVec value) { return (Vec)value; }
+
+#else
+
+// The compiler takes vectors wider than a register apart lane by lane in comparisons, so parts of one register are kept.
+#if defined(__AVX2__)
+constexpr int kParts = 2;
+#else
+constexpr int kParts = 4;
+#endif
+typedef float FloatPart __attribute__((vector_size(64 / kParts)));
+typedef int32_t IntPart __attribute__((vector_size(64 / kParts)));
+
+struct Vec {
+  FloatPart part[kParts];
+  RF_INLINE float operator[](int lane) const { return part[lane / (kLanes / kParts)][lane % (kLanes / kParts)]; }
+};
+
+struct IntVec {
+  IntPart part[kParts];
+};
+
+#define RF_EACH_PART for (int at = 0; at < kParts; ++at)
+#define RF_BINARY(Result, op)                                    \
+  RF_INLINE Result operator op(const Vec& a, const Vec& b) {     \
+    Result result;                                               \
+    RF_EACH_PART result.part[at] = a.part[at] op b.part[at];     \
+    return result;                                               \
+  }                                                              \
+  RF_INLINE Result operator op(const Vec& a, float b) {          \
+    Result result;                                               \
+    RF_EACH_PART result.part[at] = a.part[at] op(FloatPart{} + b); \
+    return result;                                               \
+  }                                                              \
+  RF_INLINE Result operator op(float a, const Vec& b) {          \
+    Result result;                                               \
+    RF_EACH_PART result.part[at] = (FloatPart{} + a)op b.part[at]; \
+    return result;                                               \
+  }
+RF_BINARY(Vec, +)
+RF_BINARY(Vec, -)
+RF_BINARY(Vec, *)
+RF_BINARY(Vec, /)
+RF_BINARY(IntVec, <)
+RF_BINARY(IntVec, >)
+RF_BINARY(IntVec, <=)
+RF_BINARY(IntVec, >=)
+#undef RF_BINARY
+
+RF_INLINE Vec operator-(const Vec& a) { return 0.0f - a; }
+RF_INLINE Vec& operator+=(Vec& a, const Vec& b) { return a = a + b; }
+RF_INLINE Vec& operator-=(Vec& a, const Vec& b) { return a = a - b; }
+RF_INLINE Vec& operator*=(Vec& a, const Vec& b) { return a = a * b; }
+
+#define RF_BINARY(op)                                              \
+  RF_INLINE IntVec operator op(const IntVec& a, const IntVec& b) { \
+    IntVec result;                                                 \
+    RF_EACH_PART result.part[at] = a.part[at] op b.part[at];       \
+    return result;                                                 \
+  }
+RF_BINARY(&)
+RF_BINARY(+)
+#undef RF_BINARY
+
+RF_INLINE IntVec& operator&=(IntVec& a, const IntVec& b) { return a = a & b; }
+RF_INLINE IntVec operator&(const IntVec& a, int32_t b) {
+  IntVec result;
+  RF_EACH_PART result.part[at] = a.part[at] & b;
+  return result;
+}
+RF_INLINE IntVec operator!=(const IntVec& a, int32_t b) {
+  IntVec result;
+  RF_EACH_PART result.part[at] = a.part[at] != b;
+  return result;
+}
+RF_INLINE IntVec operator<<(const IntVec& a, int b) {
+  IntVec result;
+  RF_EACH_PART result.part[at] = a.part[at] << b;
+  return result;
+}
+
+RF_INLINE Vec select(const IntVec& mask, const Vec& yes, const Vec& no) {
+  Vec result;
+  RF_EACH_PART result.part[at] = mask.part[at] ? yes.part[at] : no.part[at];
+  return result;
+}
+RF_INLINE IntVec int_bits(const Vec& value) {
+  IntVec result;
+  RF_EACH_PART result.part[at] = (IntPart)value.part[at];
+  return result;
+}
+RF_INLINE Vec float_bits(const IntVec& value) {
+  Vec result;
+  RF_EACH_PART result.part[at] = (FloatPart)value.part[at];
+  return result;
+}
+
+#endif
 
 RF_INLINE Vec splat_vec(float value) { return Vec{} + value; }
 
@@ -29,17 +133,18 @@ RF_INLINE Vec load(const float* from) {
 
 RF_INLINE void store(float* to, Vec value) { std::memcpy(to, &value, sizeof(value)); }
 
-RF_INLINE Vec min_vec(Vec a, Vec b) { return a < b ? a : b; }
-RF_INLINE Vec max_vec(Vec a, Vec b) { return a > b ? a : b; }
+RF_INLINE Vec min_vec(Vec a, Vec b) { return select(a < b, a, b); }
+RF_INLINE Vec max_vec(Vec a, Vec b) { return select(a > b, a, b); }
 RF_INLINE Vec clamp_vec(Vec value, Vec low, Vec high) { return min_vec(max_vec(value, low), high); }
 
 RF_INLINE Vec sqrt_vec(Vec value) {
 #if defined(__AVX512F__)
   return (Vec)_mm512_sqrt_ps((__m512)value);
 #else
-  Vec result;
-  for (int lane = 0; lane < kLanes; ++lane) result[lane] = __builtin_sqrtf(value[lane]);
-  return result;
+  alignas(64) float lanes[kLanes];
+  store(lanes, value);
+  for (int lane = 0; lane < kLanes; ++lane) lanes[lane] = __builtin_sqrtf(lanes[lane]);
+  return load(lanes);
 #endif
 }
 
@@ -53,7 +158,9 @@ RF_INLINE uint32_t bits_of(IntVec mask) {
   return static_cast<uint32_t>(_mm256_movemask_ps(half[0])) | (static_cast<uint32_t>(_mm256_movemask_ps(half[1])) << 8);
 #else
   uint32_t bits = 0;
-  for (int lane = 0; lane < kLanes; ++lane) bits |= (static_cast<uint32_t>(mask[lane]) & 1u) << lane;
+  int32_t lanes[kLanes];
+  std::memcpy(lanes, &mask, sizeof(mask));
+  for (int lane = 0; lane < kLanes; ++lane) bits |= (static_cast<uint32_t>(lanes[lane]) & 1u) << lane;
   return bits;
 #endif
 }
@@ -85,8 +192,7 @@ RF_INLINE Vec exp_vec(Vec x) {
   p = p * fraction + 2.402264689e-1f;
   p = p * fraction + 6.931472028e-1f;
   p = p * fraction + 1.0f;
-  const IntVec exponent = (IntVec)shifted << 23;
-  return (Vec)((IntVec)p + exponent);
+  return float_bits(int_bits(p) + (int_bits(shifted) << 23));
 }
 
 }  // namespace

@@ -16,14 +16,14 @@ namespace {
 using namespace rf3dgs;
 
 constexpr int kBlocks = 16;
-constexpr Vec kColumn = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
-constexpr Vec kRow = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
+constexpr float kColumns[kLanes] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
+constexpr float kRows[kLanes] = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
 
 // The least d^T conic d over each block's pixel centres' rectangle decides: a convex form's least value over a rectangle
 // lies on an edge that faces the centre, or is zero inside.
 uint32_t blocks_reached(const Splat& splat, float tile_x, float tile_y) {
-  const Vec left = 4.0f * kColumn + (tile_x + 0.5f - splat.x), right = left + 3.0f;
-  const Vec top = 4.0f * kRow + (tile_y + 0.5f - splat.y), bottom = top + 3.0f;
+  const Vec left = 4.0f * load(kColumns) + (tile_x + 0.5f - splat.x), right = left + 3.0f;
+  const Vec top = 4.0f * load(kRows) + (tile_y + 0.5f - splat.y), bottom = top + 3.0f;
   const Vec near_x = clamp_vec(Vec{}, left, right), near_y = clamp_vec(Vec{}, top, bottom);
   const Vec edge_y = clamp_vec(near_x * (-splat.b / splat.c), top, bottom);
   const Vec edge_x = clamp_vec(near_y * (-splat.b / splat.a), left, right);
@@ -50,15 +50,15 @@ RF_INLINE Step step_of(const Splat& splat, Vec x, Vec y, Vec transmittance) {
   const IntVec seen = (step.alpha >= kAlphaMin) & (transmittance > 0.0f);
   const IntVec fits = after >= kTransmittanceStop;
   step.counts = seen & fits;
-  step.weight = step.counts ? step.alpha * transmittance : Vec{};
-  step.next = step.counts ? after : (seen ? -transmittance : transmittance);
+  step.weight = select(step.counts, step.alpha * transmittance, Vec{});
+  step.next = select(step.counts, after, select(seen, -transmittance, transmittance));
   return step;
 }
 
 // The pixels of a block inside the picture, as a transmittance of one; others count as stopped.
 RF_INLINE Vec first_transmittance(Vec x, Vec y, int width, int height) {
   const IntVec inside = (x < static_cast<float>(width)) & (y < static_cast<float>(height));
-  return inside ? splat_vec(1.0f) : splat_vec(-1.0f);
+  return select(inside, splat_vec(1.0f), splat_vec(-1.0f));
 }
 
 template <int C>
@@ -66,8 +66,8 @@ void blend_channels(const Tile& tile, float* picture, float* weight) {
   Vec x[kBlocks], y[kBlocks], transmittance[kBlocks], colour[kBlocks][C] = {};
   uint32_t alive = 0;
   for (int block = 0; block < kBlocks; ++block) {
-    x[block] = kColumn + (tile.x + 4 * (block % 4) + 0.5f);
-    y[block] = kRow + (tile.y + 4 * (block / 4) + 0.5f);
+    x[block] = load(kColumns) + (tile.x + 4 * (block % 4) + 0.5f);
+    y[block] = load(kRows) + (tile.y + 4 * (block / 4) + 0.5f);
     transmittance[block] = first_transmittance(x[block], y[block], tile.width, tile.height);
     if (bits_of(transmittance[block] > 0.0f) != 0) alive |= 1u << block;
   }
@@ -105,8 +105,8 @@ void blend_channels_backward(const Tile& tile, const float* picture, const float
   Vec x[kBlocks], y[kBlocks], transmittance[kBlocks], behind[kBlocks], h[kBlocks], g[kBlocks][C];
   uint32_t alive = 0;
   for (int block = 0; block < kBlocks; ++block) {
-    x[block] = kColumn + (tile.x + 4 * (block % 4) + 0.5f);
-    y[block] = kRow + (tile.y + 4 * (block / 4) + 0.5f);
+    x[block] = load(kColumns) + (tile.x + 4 * (block % 4) + 0.5f);
+    y[block] = load(kRows) + (tile.y + 4 * (block / 4) + 0.5f);
     transmittance[block] = first_transmittance(x[block], y[block], tile.width, tile.height);
     if (bits_of(transmittance[block] > 0.0f) != 0) alive |= 1u << block;
     alignas(64) float total[kLanes] = {}, of_weight[kLanes] = {}, of_channel[C][kLanes] = {};
@@ -143,7 +143,7 @@ void blend_channels_backward(const Tile& tile, const float* picture, const float
       }
       behind[block] -= step.weight * worth;
       const Vec of_alpha = transmittance[block] * worth - behind[block] / (1.0f - step.alpha);
-      const Vec of_power = (step.counts & step.unclamped) ? of_alpha * step.alpha : Vec{};
+      const Vec of_power = select(step.counts & step.unclamped, of_alpha * step.alpha, Vec{});
       transmittance[block] = step.next;
       sum += of_power;
       if constexpr (kGeometry) {

@@ -35,7 +35,7 @@ RF_INLINE Vec gather(const float* from, const size_t* index, int stride, int col
   return load(lanes);
 }
 
-RF_INLINE IntVec is_finite(Vec value) { return ((IntVec)value & 0x7f800000) != 0x7f800000; }
+RF_INLINE IntVec is_finite(Vec value) { return (int_bits(value) & 0x7f800000) != 0x7f800000; }
 
 RF_INLINE bool all_finite(const float* values, int count) {
   bool fine = true;
@@ -214,7 +214,7 @@ void project_backward(const View& view, const Parameters& in, const Splat* splat
     const Vec j00 = w[0] * dt[0] + w[1] * dt[1] + w[2] * dt[2], j02 = w[6] * dt[0] + w[7] * dt[1] + w[8] * dt[2];
     const Vec j11 = w[3] * dt[3] + w[4] * dt[4] + w[5] * dt[5], j12 = w[6] * dt[3] + w[7] * dt[4] + w[8] * dt[5];
     const Vec none = Vec{};
-    const Vec du = p.u_free ? -jx * j02 : none, dv = p.v_free ? -jy * j12 : none;
+    const Vec du = select(p.u_free, -jx * j02, none), dv = select(p.v_free, -jy * j12, none);
     const Vec px = inverse_z * du + jx * gx;
     const Vec py = inverse_z * dv + jy * gy;
     const Vec pz = inverse_z * (-jx * j00 - jy * j11 + jx * p.u * j02 + jy * p.v * j12) -
