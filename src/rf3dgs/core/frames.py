@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -90,7 +91,7 @@ class Pose:
         length = torch.linalg.vector_norm(orientation, dim=-1, keepdim=True)
         if not bool((torch.isfinite(length) & (length > 1e-6)).all()):
             raise InputError("orientation has a zero or non-finite quaternion; use (1, 0, 0, 0) for no rotation")
-        batch = torch.broadcast_shapes(position.shape[:-1], orientation.shape[:-1])
+        batch = np.broadcast_shapes(position.shape[:-1], orientation.shape[:-1])  # torch's own would import sympy
         object.__setattr__(self, "position", position.expand(*batch, 3))
         object.__setattr__(self, "orientation", (orientation / length).expand(*batch, 4))
 

@@ -106,33 +106,45 @@ def save_spectrum_figure(
     spectrum: Spectrum, path: str | Path, *, window: DbWindow | None = None, title: str = ""
 ) -> None:
     """Write the spectrum as a PNG figure with axes in degrees and a colour bar in dB."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LinearSegmentedColormap, Normalize
-    from matplotlib.figure import Figure
+    from PIL import Image, ImageDraw, ImageFont
 
-    from rf3dgs.evaluation.panels import axis_ticks
+    from rf3dgs.evaluation.panels import axis_ticks, even_ticks
 
     _one(spectrum)
     window = window_of(spectrum) if window is None else window
     height, width = spectrum.grid.shape
-    figure = Figure(figsize=(8.0, 1.6 + 6.4 * min(height / width, 1.2)), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.imshow(
-        spectrum_picture(spectrum, window), interpolation="nearest", extent=(0, width, height, 0), aspect="equal"
-    )
+    zoom = max(1, round(900 / width))
+    left, top, right, bottom = 78, 40 if title else 16, 130, 62
+    wide, high = zoom * width, zoom * height
+    figure = Image.new("RGB", (left + wide + right, top + high + bottom), "white")
+    draw, font = ImageDraw.Draw(figure), ImageFont.load_default(16)
+    picture = Image.fromarray(spectrum_picture(spectrum, window))
+    figure.paste(picture.resize((wide, high), Image.Resampling.NEAREST), (left, top))
+    draw.rectangle((left - 1, top - 1, left + wide, top + high), outline="black")
     across, down = axis_ticks(spectrum.grid)
-    axes.set_xticks([place for place, _ in across], [text for _, text in across])
-    axes.set_yticks([place for place, _ in down], [text for _, text in down])
-    axes.set_xlabel("azimuth [deg], left is positive")
-    axes.set_ylabel("zenith [deg]")
-    axes.set_title(title)
-    colours = LinearSegmentedColormap.from_list("level", LEVEL_COLOURS / 255.0)
-    scale = ScalarMappable(Normalize(window.floor_db, window.ceil_db), colours)
-    figure.colorbar(scale, ax=axes, label="power [dB]", shrink=0.85)
+    for place, text in across:
+        x = left + zoom * place
+        draw.line((x, top + high, x, top + high + 5), fill="black")
+        draw.text((x, top + high + 8), text, "black", font, anchor="ma")
+    for place, text in down:
+        y = top + zoom * place
+        draw.line((left - 6, y, left - 1, y), fill="black")
+        draw.text((left - 10, y), text, "black", font, anchor="rm")
+    draw.text((left + wide / 2, top + high + 32), "azimuth [deg], left is positive", "black", font, anchor="ma")
+    label = Image.new("RGB", (high, 20), "white")
+    ImageDraw.Draw(label).text((high / 2, 10), "zenith [deg]", "black", font, anchor="mm")
+    figure.paste(label.rotate(90, expand=True), (6, top))
+    draw.text((left + wide / 2, 10), title, "black", font, anchor="ma")
+    bar = left + wide + 24
+    scale = np.repeat(coloured(np.linspace(1.0, 0.0, high))[:, None], 18, 1)
+    figure.paste(Image.fromarray(scale), (bar, top))
+    draw.rectangle((bar - 1, top - 1, bar + 18, top + high), outline="black")
+    for share, text in even_ticks(window.floor_db, window.ceil_db):
+        y = top + high * (1.0 - share)
+        draw.line((bar + 18, y, bar + 23, y), fill="black")
+        draw.text((bar + 27, y), f"{text} dB", "black", font, anchor="lm")
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    figure.save(buffer, format="png")
     write_whole(path, buffer.getvalue())
 
 
