@@ -46,6 +46,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if list(arguments) in (["--version"], ["version"]):
         print(f"rf3dgs {__version__}")  # noqa: T201
         return 0
+    # torch's idle OpenMP threads spin for milliseconds after every operation; on a shared or small machine that costs
+    # more than the work. The variable is read when torch is imported, which no line above does.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     logging.basicConfig(level=os.environ.get("RF3DGS_LOG", "WARNING").upper(), format="%(name)s: %(message)s")
     command = tyro.cli(
         Command,  # type: ignore[arg-type]
