@@ -17,8 +17,8 @@ from rf3dgs.splats.harmonics import basis, view_directions
 from rf3dgs.splats.rasterize import Backend, rasterize
 from rf3dgs.training.radio_views import RadioView
 
-CELLS = (2.0, 0.7)
-HALF_WEIGHT = 0.3
+CELLS = (2.0, 1.0, 0.4)
+HALF_WEIGHT = 1.0
 LEAST_WEIGHT = 0.02
 
 

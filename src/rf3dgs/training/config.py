@@ -8,7 +8,7 @@ from typing import Literal
 class RadioConfig:
     """The radio stage: opacity and CSI-encoded harmonics on frozen geometry."""
 
-    steps: int = 2000
+    steps: int = 1000
     """Iterations; each takes one training position and one of its pictures (a cube face, or its pinhole picture)."""
     csi_every: int = 2
     """Delay and departure are trained in every n-th iteration; 0 leaves them at their geometric prior."""
@@ -35,13 +35,13 @@ class RadioConfig:
     "mean" takes the mean back-projected level, "grey" is the paper's 0.5 everywhere."""
     ridge: float = 1.0
     """Strength that draws a Gaussian's first harmonics to those of its neighbourhood; used by start="ridge"."""
-    lr_level: float = 5e-3
+    lr_level: float = 1e-3
     """Adam's learning rate of the constant harmonic [window units]."""
-    lr_harmonics: float = 1e-3
+    lr_harmonics: float = 2e-4
     """Adam's learning rate of the other gain harmonics [window units]."""
-    lr_opacity: float = 2e-2
+    lr_opacity: float = 5e-3
     """Adam's learning rate of the opacity logits."""
-    lr_csi: float = 1e-2
+    lr_csi: float = 2e-3
     """Adam's learning rate of the delay and departure harmonics [delay unit, unit vector]."""
     lr_final: float = 0.1
     """All learning rates fall exponentially to this share of their start."""
@@ -57,13 +57,29 @@ class RadioConfig:
     checkpoint_every: int = 500
     """Iterations between checkpoints when a checkpoint folder is given."""
 
+    @classmethod
+    def paper(cls, steps: int = 10_000, seed: int = 0) -> "RadioConfig":
+        """The published recipe: its encoding, harmonics from grey, the line of sight on the surface, larger rates."""
+        return cls(
+            steps=steps,
+            seed=seed,
+            encoding="paper",
+            line_of_sight="surface",
+            start="grey",
+            lr_level=5.6e-3,
+            lr_harmonics=1.4e-3,
+            lr_opacity=5e-2,
+            lr_csi=5.6e-3,
+        )
+
 
 @dataclass(frozen=True)
 class VisualConfig:
     """The visual stage: photographs become Gaussians by 3D Gaussian Splatting.
 
     Iteration counts that are None follow from `steps`: the published values for long runs, shares of the run for short
-    ones (`rf3dgs.training.schedule` has the rule).
+    ones. Learning rates are for the published 30,000 steps; shorter runs multiply all but opacity's by
+    sqrt(30,000 / steps), at most 4.
     """
 
     steps: int = 30_000

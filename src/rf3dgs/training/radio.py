@@ -32,6 +32,7 @@ from rf3dgs.training.loop import train, view_at
 from rf3dgs.training.radio_views import RadioView, radio_views
 
 DELAY_SCALE_NS = 10.0
+START_DEGREE = 2
 
 
 def fit_radio(
@@ -217,7 +218,7 @@ class RadioStage:
         config, bare = self.config, self.bare
         if config.start == "grey":
             return bare.gain_sh, bare.csi_sh
-        degree = config.degree if config.start == "ridge" else 0
+        degree = min(config.degree, START_DEGREE) if config.start == "ridge" else 0
         with torch.enable_grad():
             found, csi = ridge_start(
                 bare, self.views, self.visible, degree=degree, ridge=config.ridge, backend=config.backend
