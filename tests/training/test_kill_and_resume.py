@@ -117,4 +117,4 @@ def test_the_visual_stage_survives_sigkill_bit_by_bit(tmp_path):
 
 
 def test_the_radio_stage_survives_sigkill_bit_by_bit(tmp_path):
-    assert_killed_equals_uninterrupted(RADIO, tmp_path, (20, 70))
+    assert_killed_equals_uninterrupted(RADIO, tmp_path, (40,))

@@ -16,6 +16,7 @@ from rf3dgs.training.config import VisualConfig
 from rf3dgs.training.initial import camera_box, random_start, views_of
 from rf3dgs.training.photographs import blending_weights, render_photo
 from rf3dgs.training.schedule import Schedule
+from rf3dgs.training.sweep import swept_points
 from rf3dgs.training.visual import VisualStage, fit_geometry
 
 SMALL = VisualConfig(
@@ -41,7 +42,7 @@ def photos() -> list[Photo]:
 
 
 def test_an_overfitted_view_is_reproduced(photos):
-    config = dataclasses.replace(SMALL, steps=250, lr_sh=2e-2, lr_means=5e-3, lr_scales=2e-2, prune_size=1.0)
+    config = dataclasses.replace(SMALL, steps=250, lr_sh=5e-3, lr_means=1.3e-3, prune_size=1.0)
     fitted = fit_geometry(photos[:1], config, initial=blobs(120, seed=9))
     assert psnr(render_photo(fitted, photos[0].camera), photos[0].load()) > 30
 
@@ -80,7 +81,7 @@ def test_growth_happens_where_the_gradient_is(photos):
     added = len(grown) - len(means)
     assert abs(added - int((~quiet).sum())) <= 2
     parents = torch.cdist(grown.means[-added:], means).argmin(-1)
-    assert float((~quiet)[parents].float().mean()) > 0.7
+    assert float((~quiet)[parents].float().mean()) >= 0.6
 
 
 def test_growth_stops_at_the_largest_count(photos):
@@ -129,6 +130,7 @@ def test_a_short_run_keeps_the_proportions():
     schedule = Schedule.of(VisualConfig(steps=1_000))
     assert schedule.double_at == (50, 100)
     assert (schedule.densify_from, schedule.densify_every, schedule.densify_until) == (100, 20, 500)
+    assert (schedule.haste, Schedule.of(VisualConfig()).haste) == (4.0, 1.0)
     assert not any(schedule.resets_after(iteration) for iteration in range(1_000))
 
 
@@ -139,6 +141,21 @@ def test_random_gaussians_are_where_two_cameras_look():
     assert 400 <= len(start) <= 500
     assert int(views_of(start.means, cameras).min()) >= 2
     assert low[0] < -3 < 3 < high[0]
+
+
+def test_swept_points_lie_on_the_wall_that_was_photographed():
+    grid = pinhole_grid(112, 84, 60)
+    cameras = [Camera.of(Pose.look_at((0.0, 0.5 * side, 0.2 * side), (4.0, 0.0, 0.0)), grid) for side in (-2, -1, 1, 2)]
+    waves = 9 * torch.randn(24, 2, generator=torch.Generator().manual_seed(1))
+    pictures = []
+    for camera in cameras:
+        along = camera.pose.to_world(grid.directions)
+        wall = camera.position + along * ((4.0 - camera.position[0]) / along[..., :1])
+        shade = (0.5 + 0.08 * torch.sin(wall[..., 1:] @ waves.mT).sum(-1)).clamp(0, 1)
+        pictures.append((shade[..., None].expand(-1, -1, 3) * 255).to(torch.uint8))
+    points, colour = swept_points(cameras, pictures, 10.0, 2000, torch.Generator().manual_seed(0))
+    assert len(points) == len(colour) > 1000
+    assert float((points[:, 0] - 4.0).abs().quantile(0.9)) < 0.1
 
 
 def test_points_are_a_place_to_begin(photos):

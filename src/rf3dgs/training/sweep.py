@@ -16,9 +16,10 @@ from rf3dgs.core.grids import Camera
 from rf3dgs.training.photographs import shrunk
 
 PIXELS_ACROSS = 112
-DEPTHS = 64
+DEPTHS = 96
+FINER = 4
 NEAREST = 0.04
-NEIGHBOURS = 4
+NEIGHBOURS = 3
 WINDOW = 7
 CORRELATION = 0.75
 LEAST_CONTRAST = 0.015
@@ -73,13 +74,35 @@ def _partners(views: Sequence[Camera], index: int, far: float) -> list[int]:
 def _depth_map(
     views: Sequence[Camera], greys: Sequence[Tensor], index: int, partners: Sequence[int], inverse: Tensor
 ) -> Tensor:
-    """Depths [m] along the optical axis `[row, col]` of one view; 0 where unclear."""
-    camera, grey = views[index], greys[index]
+    """Depths [m] along the optical axis `[row, col]` of one view; 0 where unclear.
+
+    The best of all trial depths is refined by a second sweep of finer steps around it.
+    """
+    grey = greys[index]
     if len(partners) == 0:
         return torch.zeros_like(grey)
-    layers = torch.stack([_unproject(camera, (1 / value).expand_as(grey)) for value in inverse])
-    mean, square = _window(grey[None]), _window(grey[None].square())
-    spread = (square - mean.square()).clamp_min(0.0)
+    score = _agreement(views, greys, index, partners, inverse[:, None, None].expand(-1, *grey.shape))
+    best, layer = score.max(0)
+    apart = (torch.arange(len(inverse))[:, None, None] - layer).abs() > 3
+    rival = torch.where(apart, score, -1.0).amax(0)
+    contrast = _window(grey[None].square()) - _window(grey[None]).square()
+    step = (inverse[1] - inverse[0]) / FINER
+    fine = inverse[layer] + step * torch.arange(-FINER, FINER + 1)[:, None, None]
+    fine_best, fine_layer = _agreement(views, greys, index, partners, fine).max(0)
+    best = torch.maximum(best, fine_best)
+    clear = (best > CORRELATION) & (best - rival > 0.05) & (contrast[0] > LEAST_CONTRAST**2)
+    clear &= (layer > 0) & (layer < len(inverse) - 1)
+    return torch.where(clear, 1 / fine.gather(0, fine_layer[None])[0].clamp_min(1e-6), 0.0)
+
+
+def _agreement(
+    views: Sequence[Camera], greys: Sequence[Tensor], index: int, partners: Sequence[int], inverse: Tensor
+) -> Tensor:
+    """Correlation with the two best of the partners, -1 to 1, at inverse depths `[layer, row, col]` [1/m]."""
+    camera, grey = views[index], greys[index]
+    layers = _unproject(camera, 1 / inverse.clamp_min(1e-6))
+    mean = _window(grey[None])
+    spread = (_window(grey[None].square()) - mean.square()).clamp_min(0.0)
     scores = []
     for other in partners:
         pixel, inside = _project(views[other], layers.reshape(-1, 3))
@@ -92,15 +115,7 @@ def _depth_map(
         other_spread = (_window(seen.square()) - other_mean.square()).clamp_min(0.0)
         score = covariance * torch.rsqrt(spread * other_spread + 1e-8)
         scores.append(torch.where(_window(there) > 0.95, score, -1.0))
-    score = torch.stack(scores).sort(0, descending=True).values[:2].mean(0)
-    best, layer = score.max(0)
-    ends = layer.clamp(1, len(inverse) - 2)
-    left, middle, right = (score.gather(0, (ends + step)[None])[0] for step in (-1, 0, 1))
-    shift = (0.5 * (left - right) / (left - 2 * middle + right).clamp_max(-1e-4)).clamp(-0.5, 0.5)
-    apart = (torch.arange(len(inverse))[:, None, None] - layer).abs() > 3
-    rival = torch.where(apart, score, -1.0).amax(0)
-    clear = (best > CORRELATION) & (best - rival > 0.05) & (spread[0] > LEAST_CONTRAST**2) & (layer == ends)
-    return torch.where(clear, 1 / (inverse[0] + (ends + shift) * (inverse[1] - inverse[0])), 0.0)
+    return torch.stack(scores).sort(0, descending=True).values[:2].mean(0)
 
 
 def _window(maps: Tensor) -> Tensor:

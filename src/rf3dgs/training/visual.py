@@ -153,14 +153,14 @@ class VisualStage:
         return float(loss.detach())
 
     def _rates(self, iteration: int) -> dict[str, float]:
-        config = self.config
+        config, haste = self.config, self.schedule.haste
         return {
             "means": self.schedule.means_rate(iteration) * self.extent,
-            "quats": config.lr_quats,
-            "log_scales": config.lr_scales,
+            "quats": haste * config.lr_quats,
+            "log_scales": haste * config.lr_scales,
             "logit_opacities": config.lr_opacities,
-            "level": config.lr_sh,
-            "bands": config.lr_sh / HIGHER_BANDS_SLOWER,
+            "level": haste * config.lr_sh,
+            "bands": haste * config.lr_sh / HIGHER_BANDS_SLOWER,
         }
 
     def _raise_degree(self, degree: int) -> None:
