@@ -3,7 +3,7 @@
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
@@ -24,6 +24,11 @@ class FitGeometry:
     """A dataset folder, or a folder of photographs with poses (COLMAP, nerfstudio, Blender)."""
     out: Path = Path("geometry.ply")
     """The 3DGS .ply to write."""
+    poses: Literal["given", "sfm"] = "given"
+    """"sfm" finds poses and first points from the JPEG and PNG files below the folder by structure from motion (extra
+    sfm); their world has arbitrary scale and tilt."""
+    lens: Literal["radial", "pinhole"] = "radial"
+    """With --poses sfm: estimate a radial distortion, or take rendered and undistorted pictures as they are."""
     mesh: str | None = None
     """Take the geometry from this scene's mesh instead of photographs ("lobby", "box", an XML file)."""
     mesh_count: int = 40_000
@@ -34,13 +39,19 @@ class FitGeometry:
     def run(self) -> int:
         """Fit, write the .ply, and drop the checkpoints."""
         from rf3dgs.data.formats.detect import read_photos
+        from rf3dgs.data.sfm import poses_from_photos
         from rf3dgs.splats.ply import write_ply
         from rf3dgs.training.visual import fit_geometry
 
         if self.mesh is not None:
             geometry = _from_mesh(self.mesh, self.mesh_count, self.visual.seed)
         else:
-            found = read_photos(self.dataset)
+            if self.poses == "sfm":
+                found = poses_from_photos(self.dataset, lens=self.lens, progress=console())
+            else:
+                found = read_photos(self.dataset)
+            for note in found.notes:
+                out(f"note: {note}")
             roles = found.roles or ("train",) * len(found.photos)
             photos = [photo for photo, role in zip(found.photos, roles, strict=True) if role == "train"]
             with_checkpoints = checkpoints(self.out)
