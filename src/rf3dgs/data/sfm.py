@@ -64,24 +64,29 @@ def poses_from_photos(
         read_picture(folder / name)
     with _quiet(pycolmap), tempfile.TemporaryDirectory(prefix="rf3dgs-sfm-") as work:
         models = _reconstruct(pycolmap, folder, names, camera, lens, seed, Path(work), progress)
-        model = the_model({number: item.num_reg_images() for number, item in models.items()}, len(names), folder)
-        return _photo_set(pycolmap, models[model], folder, names)
+        registered = {number: set(_registered(model)) for number, model in models.items()}
+        return _photo_set(pycolmap, models[the_model(registered, len(names), folder)], folder, names)
 
 
-def the_model(registered: Mapping[int, int], pictures: int, folder: Path) -> int:
-    """The number of the one model that holds enough of the pictures; `registered` counts the pictures of each model."""
-    if not registered:
+def the_model(registered: Mapping[int, set[str]], pictures: int, folder: Path) -> int:
+    """The number of the one model that holds enough of the pictures; `registered` names the pictures of each model.
+
+    Scraps of fewer than three pictures and models whose pictures the largest one has too are passed over.
+    """
+    number = max(registered, key=lambda number: (len(registered[number]), -number), default=None)
+    if number is None:
         raise DataError(f"{folder}: no poses could be found for its {pictures} pictures; {MORE_OVERLAP}")
-    if len(registered) > 1:
-        counts = " and ".join(str(count) for count in sorted(registered.values(), reverse=True))
+    largest = registered[number]
+    others = [len(names) for names in registered.values() if len(names) >= FEWEST and not names <= largest]
+    if others:
+        counts = " and ".join(str(count) for count in (len(largest), *sorted(others, reverse=True)))
         raise DataError(
-            f"{folder}: the {pictures} pictures fall into {len(registered)} models of {counts}, whose scales and tilts "
+            f"{folder}: the {pictures} pictures fall into {1 + len(others)} models of {counts}, whose scales and tilts "
             f"have nothing to do with each other; {MORE_OVERLAP}"
         )
-    (number, count), *_ = registered.items()
-    if count < REGISTERED * pictures:
+    if len(largest) < REGISTERED * pictures:
         raise DataError(
-            f"{folder}: only {count} of {pictures} pictures could be registered, expected at least "
+            f"{folder}: only {len(largest)} of {pictures} pictures could be registered, expected at least "
             f"{REGISTERED:.0%}; {MORE_OVERLAP}, or remove the others"
         )
     return number
@@ -147,12 +152,13 @@ def _reconstruct(
     return models
 
 
+def _registered(model: Any) -> dict[str, Any]:
+    """The images of a model that have a pose, by name."""
+    return {image.name: image for image in model.images.values() if image.has_pose}
+
+
 def _photo_set(pycolmap: Any, model: Any, folder: Path, names: list[str]) -> PhotoSet:
-    photos = [
-        _photo(pycolmap, model, image, folder)
-        for image in sorted(model.images.values(), key=lambda image: image.name)
-        if image.has_pose
-    ]
+    photos = [_photo(pycolmap, model, image, folder) for _, image in sorted(_registered(model).items())]
     points = sorted(model.points3D.items())
     xyz = torch.from_numpy(np.array([point.xyz for _, point in points], dtype=np.float32).reshape(-1, 3))
     paint = torch.from_numpy(np.array([point.color for _, point in points], dtype=np.float32).reshape(-1, 3)) / 255.0
