@@ -24,6 +24,7 @@ from rf3dgs.training.visual import fit_geometry
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--keep-data", action="store_true", help="train only")
+    parser.add_argument("--only-data", action="store_true", help="trace and photograph only")
     parser.add_argument("--to", type=Path, default=ASSETS, help="the folder to write")
     options = parser.parse_args()
     progress, demo = console(), Demo()
@@ -37,12 +38,14 @@ def main() -> None:
             equirect_grid(*demo.grid),
             receivers=demo.receivers,
             photos=demo.photos,
-            trace=TraceConfig(),
-            photo=PhotoConfig(samples=256),
+            trace=TraceConfig(passes=5),
+            photo=PhotoConfig(samples=128),
             seed=demo.seed,
             progress=progress,
         )
     out(f"{dataset}")
+    if options.only_data:
+        return
     train = dataset.train
     assert train.spectra is not None
     geometry = fit_geometry(train.photos, demo.visual, progress=progress)

@@ -29,7 +29,7 @@ class Demo:
     """Where the Gaussians come from; "auto" takes photographs in the lobby and the mesh elsewhere."""
     seed: int = 0
     """Of everything random."""
-    receivers: int = 72
+    receivers: int = 80
     """Receiver positions when tracing."""
     photos: int = 60
     """Photographs when rendering them."""
