@@ -26,15 +26,20 @@ def open_field(name: str | Path) -> "RadioField":
 
 
 def open_dataset(name: str | Path, *, unseal_test: bool = False) -> "Dataset":
-    """The dataset in a folder, or the shipped one for "lobby"."""
+    """The dataset in a folder, or the shipped one for "lobby"; values in impossible units are refused."""
     from rf3dgs.data.dataset import Dataset
+    from rf3dgs.data.formats.native import SPECTRA
+    from rf3dgs.data.validate_spectra import check_units
 
     path = Path(name)
     if str(name) == "lobby" and not path.exists():
         path = ASSETS / "lobby"
     if not path.is_dir():
         raise InputError(f'there is no dataset folder {path}; make one with rf3dgs spectra, or name "lobby"')
-    return Dataset.load(path, unseal_test=unseal_test)
+    dataset = Dataset.load(path, unseal_test=unseal_test)
+    if (path / SPECTRA).exists():
+        check_units(path / SPECTRA)
+    return dataset
 
 
 def open_scene(name: str) -> "Scene":

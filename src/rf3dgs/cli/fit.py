@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 from rf3dgs.cli.show import console, out
-from rf3dgs.core.errors import InputError
+from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.training.config import RadioConfig, VisualConfig
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from rf3dgs.data.dataset import Dataset
+    from rf3dgs.spectra.spectrum import Spectrum
     from rf3dgs.splats.gaussians import Gaussians
 
 
@@ -84,7 +87,8 @@ class FitRadio:
         from rf3dgs.cli.facts import open_dataset
         from rf3dgs.splats.ply import read_ply
 
-        fit_field(read_ply(self.geometry), open_dataset(self.dataset), self.out, self.radio, self.estimate_tx)
+        geometry, dataset = read_ply(self.geometry), open_dataset(self.dataset)
+        fit_field(geometry, dataset, self.out, self.radio, self.estimate_tx, source=str(self.geometry))
         return 0
 
 
@@ -113,6 +117,7 @@ class Fit:
         from rf3dgs.training.visual import fit_geometry
 
         dataset = open_dataset(self.dataset)
+        training_spectra(dataset)
         if self.mesh is not None:
             geometry = _from_mesh(self.mesh, self.mesh_count, self.visual.seed)
         elif not dataset.train.photos:
@@ -120,21 +125,27 @@ class Fit:
         else:
             folder = checkpoints(self.out) / "visual"
             geometry = fit_geometry(dataset.train.photos, self.visual, progress=console(), checkpoint_dir=folder)
-        fit_field(geometry, dataset, self.out, self.radio, self.estimate_tx)
+        source = self.mesh or str(dataset.path)
+        fit_field(geometry, dataset, self.out, self.radio, self.estimate_tx, source=source)
         return 0
 
 
 def fit_field(
-    geometry: "Gaussians", dataset: "Dataset", path: Path, config: RadioConfig, estimate_tx: bool = False
+    geometry: "Gaussians",
+    dataset: "Dataset",
+    path: Path,
+    config: RadioConfig,
+    estimate_tx: bool = False,
+    *,
+    source: str = "the geometry",
 ) -> None:
-    """Train the radio stage with checkpoints, save the field, and say how large it is."""
+    """Train the radio stage with checkpoints, save the field, and say how large it is; `source` names the geometry."""
     from dataclasses import replace
 
     from rf3dgs.training.radio import fit_radio
 
-    spectra = dataset.train.spectra
-    if spectra is None or not len(spectra):
-        raise InputError("the dataset has no training spectra; make some with rf3dgs spectra")
+    spectra = training_spectra(dataset)
+    check_world(geometry, spectra.pose.position, source)
     spectra = replace(spectra, tx=None) if estimate_tx else spectra
     folder = checkpoints(path) / "radio"
     trained = fit_radio(geometry, spectra, config, progress=console(), checkpoint_dir=folder)
@@ -142,6 +153,40 @@ def fit_field(
     drop_checkpoints(path)
     size = sum(file.stat().st_size for file in path.iterdir()) / 1e6
     out(f"{path}: {len(trained.surface):,} Gaussians, {size:.1f} MB")
+
+
+def training_spectra(dataset: "Dataset") -> "Spectrum":
+    """The spectra to learn from, refused before any training when there are none or one of them teaches nothing."""
+    from rf3dgs.data.formats.native import SPECTRA
+    from rf3dgs.training.radio import check_spectra
+
+    part = dataset.train
+    if part.spectra is None or not len(part.spectra):
+        raise InputError(f"{dataset.path} has no training spectra; make some with rf3dgs spectra")
+    try:
+        check_spectra(part.spectra, part.index)
+    except InputError as error:
+        raise DataError(f"{dataset.path}/{SPECTRA}: {error}") from error
+    return part.spectra
+
+
+def check_world(geometry: "Gaussians", positions: "Tensor", source: str) -> None:
+    """Refuse geometry that cannot be in the metric world of the receivers at `positions` `[n, 3]` [m]."""
+    import numpy as np
+
+    low, high = np.quantile(geometry.means.numpy(), (0.01, 0.99), axis=0)
+    extent, reach = float((high - low).max()), float((positions.amax(0) - positions.amin(0)).max())
+    if extent > 1000.0 and extent > 300.0 * max(reach, 1.0):
+        raise DataError(
+            f"{source}: the geometry spans {extent:.0f} m around receivers that span {reach:.1f} m, as millimetres do; "
+            "convert it to metres"
+        )
+    away = np.abs(positions.numpy() - (low + high) / 2) > 1.5 * (high - low) + 1.0
+    if away.any(1).mean() > 0.5:
+        raise DataError(
+            f"{source}: {int(away.any(1).sum())} of {len(positions)} receivers stand far outside the geometry, which "
+            f"spans {extent:.3g} m; align it with the world of the spectra, in metres with z up"
+        )
 
 
 def checkpoints(path: Path) -> Path:

@@ -24,12 +24,10 @@ def spectra_faults(path: Path) -> Found:
     again = "Write the spectra again"
     try:
         with open_audited(path) as file:
-            for name in ("spectra", "repeat"):
-                group = file.get(name)
-                if isinstance(group, h5py.Group):
-                    yield from _group_faults(group, name)
-                elif name == "spectra":
-                    yield "the group 'spectra' is missing", again
+            if not isinstance(file.get("spectra"), h5py.Group):
+                yield "the group 'spectra' is missing", again
+            for name, group in _groups(file):
+                yield from _group_faults(group, name)
     except DataError as error:
         yield _sentence(path, error), again
         return
@@ -42,6 +40,19 @@ def spectra_faults(path: Path) -> Found:
         yield _sentence(path, error), again
 
 
+def check_units(path: Path) -> None:
+    """Refuse a sound file of spectra whose values cannot be in the units it states: DataError with the remedy."""
+    with open_audited(path) as file:
+        for name, group in _groups(file):
+            for what, remedy in _unit_faults(group, name):
+                raise DataError(f"{path}: {what}. {remedy}")
+
+
+def _groups(file: h5py.File) -> list[tuple[str, h5py.Group]]:
+    found = ((name, file.get(name)) for name in ("spectra", "repeat"))
+    return [(name, group) for name, group in found if isinstance(group, h5py.Group)]
+
+
 def _group_faults(group: h5py.Group, name: str) -> Found:
     positions, orientations = (read_array(group, key).astype(np.float64) for key in ("position", "orientation"))
     gain, some = _scaled(group, "gain")
@@ -52,12 +63,27 @@ def _group_faults(group: h5py.Group, name: str) -> Found:
         return
     yield from _pose_faults(positions, orientations, name)
     yield from _gain_faults(gain, some, name)
+    yield from _unit_faults(group, name)
+
+
+def _unit_faults(group: h5py.Group, name: str) -> Found:
+    """Values that no spectrum has in the units of the file."""
+    gain, some = _scaled(group, "gain")
+    if some.any():
+        peak, least = float(gain[some].max()), float(gain[some].min())
+        if peak > MAX_GAIN_DB:
+            what = f"{name}: the gain reaches {peak:.1f} dB, which no path gain does"
+            yield what, "It is a level in dBm or another unit; subtract the transmit power and store dB"
+        elif least >= 0.0 and peak <= 1.0 and peak > least:
+            what = f"{name}: all gains lie between {least:.3g} and {peak:.3g} dB, as linear power does"
+            yield what, "It is linear power; store 10 log10 of it"
     lobe = read_attribute(group, "lobe")
     if isinstance(lobe, int | float) and lobe > 2 * np.pi:
         yield (
             f"{name}: the lobe is {lobe:.3g}, more than a full turn in radians",
             "It is in degrees; convert to radians",
         )
+    positions = read_array(group, "position").astype(np.float64)
     if np.isfinite(positions).all():
         yield from _scale_faults(group, positions, some, name)
 
@@ -95,15 +121,6 @@ def _gain_faults(gain: np.ndarray, some: np.ndarray, name: str) -> Found:
     if len(constant):
         what = f"{name}: spectrum {_some(constant)} is constant, the same in every direction"
         yield what, "Remove it, or measure or trace it again"
-    if not known.any():
-        return
-    peak, least = float(high.max()), float(low.min())
-    if peak > MAX_GAIN_DB:
-        what = f"{name}: the gain reaches {peak:.1f} dB, which no path gain does"
-        yield what, "It is a level in dBm or another unit; subtract the transmit power and store dB"
-    elif least >= 0.0 and peak <= 1.0 and peak > least:
-        what = f"{name}: all gains lie between {least:.3g} and {peak:.3g} dB, as linear power does"
-        yield what, "It is linear power; store 10 log10 of it"
 
 
 def _scale_faults(group: h5py.Group, positions: np.ndarray, some: np.ndarray, name: str) -> Found:

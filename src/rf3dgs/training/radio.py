@@ -54,8 +54,9 @@ def fit_radio(
     progress = Silent() if progress is None else progress
     geometry.check()
     check_spectra(spectra)
-    where = tx or spectra.tx or estimate_transmitter(spectra)
-    estimated = tx is None and spectra.tx is None
+    where = spectra.tx if tx is None else tx
+    estimated = where is None
+    where = estimate_transmitter(spectra) if where is None else where
     window = _window(spectra, config)
     blockers = Blockers(geometry.means, geometry.quats, geometry.scales, geometry.opacities)
     sources, seen = (), torch.zeros(len(spectra), dtype=torch.bool)
@@ -116,8 +117,11 @@ def fit_radio(
     )
 
 
-def check_spectra(spectra: Spectrum) -> None:
-    """Raise InputError for spectra that nothing can be learned from, naming the position."""
+def check_spectra(spectra: Spectrum, numbers: Tensor | None = None) -> None:
+    """Raise InputError for spectra that nothing can be learned from, naming the position.
+
+    `numbers` `[position]` are what the positions are called in the message, such as their places in a file.
+    """
     if not spectra.pose.batch_shape or len(spectra.pose.batch_shape) != 1 or len(spectra) == 0:
         raise InputError(f"the radio stage needs spectra at a list of positions; got batch {spectra.pose.batch_shape}")
     power = spectra.power
@@ -129,7 +133,9 @@ def check_spectra(spectra: Spectrum) -> None:
     )
     for wrong, text in rules:
         if bool(wrong.any()):
-            raise InputError(f"the spectrum of position {int(wrong.nonzero()[0])} {text}; remove or repair it")
+            first = int(wrong.nonzero()[0])
+            number = first if numbers is None else int(numbers[first])
+            raise InputError(f"the spectrum of position {number} {text}; remove or repair it")
 
 
 class RadioStage:
