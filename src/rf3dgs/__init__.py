@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from rf3dgs.data.dataset import Dataset as Dataset
     from rf3dgs.evaluation.protocol import evaluate as evaluate
     from rf3dgs.field.radio_field import RadioField as RadioField
-    from rf3dgs.spectra.spectrum import Spectrum as Spectrum
     from rf3dgs.spectra.scan import spectrum_of as spectrum_of
+    from rf3dgs.spectra.spectrum import Spectrum as Spectrum
     from rf3dgs.splats.gaussians import Gaussians as Gaussians
     from rf3dgs.training.radio import fit_radio as fit_radio
     from rf3dgs.training.visual import fit_geometry as fit_geometry

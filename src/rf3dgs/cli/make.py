@@ -72,7 +72,7 @@ class MakePhotos:
         scene = open_scene(self.scene)
         with atomic_folder(self.out) as folder:
             photos = photograph(scene, self.count, self.tour_seed, self.photo, folder, console())
-            write_nerfstudio(photos, folder)
+            write_nerfstudio(folder, photos)
         out(f"{self.out}: {self.count} photographs of {self.photo.width}x{self.photo.height}")
         return 0
 

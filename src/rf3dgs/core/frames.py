@@ -165,11 +165,18 @@ class Pose:
     def batch_shape(self) -> tuple[int, ...]:
         return tuple(self.position.shape[:-1])
 
-    def __getitem__(self, index: object) -> "Pose":
+    def __getitem__(self, index: int | slice | Tensor) -> "Pose":
+        if not self.batch_shape:
+            raise InputError("this is one pose; there is no axis of poses to index")
         return Pose(self.position[index], self.orientation[index])
 
     def __len__(self) -> int:
+        if not self.batch_shape:
+            raise InputError("this is one pose and has no length")
         return self.position.shape[0]
+
+    def __bool__(self) -> bool:
+        return True
 
     def turned(self, yaw: float, *, about: Sequence[float] = (0.0, 0.0, 0.0)) -> "Pose":
         """The pose after the whole world turns by `yaw` [rad] about the vertical axis through `about`."""
