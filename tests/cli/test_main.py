@@ -120,7 +120,7 @@ def test_render_writes_a_picture_and_numbers(tmp_path: Path, capsys: pytest.Capt
 def test_a_receiver_outside_the_trained_volume_is_marked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = str(tmp_path / "far.png")
     assert main(["render", "lobby", "--at", "60", "5", "1.5", "--out", out, "--size", "30", "20"]) == 0
-    assert "outside the volume" in capsys.readouterr().out
+    assert "outside the volume" in capsys.readouterr().err
 
 
 def test_info_and_validate_of_the_shipped_dataset(capsys: pytest.CaptureFixture[str]) -> None:

@@ -185,7 +185,7 @@ def test_the_command_line_fits_geometry_to_pictures_without_poses(pictures, tmp_
     command = ["fit-geometry", str(few), "--poses", "sfm", "--out", str(out), "--visual.steps", "10"]
     assert main(command) == 0
     assert len(read_ply(out)) > 100
-    assert NOTE in capsys.readouterr().out
+    assert NOTE in capsys.readouterr().err
     assert sorted(item.name for item in tmp_path.iterdir()) == ["few", "geometry.ply"]
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from rf3dgs.cli.show import out
+from rf3dgs.cli.show import note, out
 from rf3dgs.core.errors import InputError
 
 Format = Literal["text", "json", "csv", "mat"]
@@ -183,4 +183,4 @@ WRITERS = {"text": text_of, "csv": csv_of, "json": json_of}
 def warn_if_outside(field, pose) -> None:
     """Say so when a receiver stands outside the volume the field was trained in."""
     if not bool(field.covers(pose)):
-        out("note: this receiver stands outside the volume of the training positions; the answer extrapolates")
+        note("this receiver stands outside the volume of the training positions; the answer extrapolates")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from rf3dgs.cli.show import console, out
+from rf3dgs.cli.show import console, note, out
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.training.config import RadioConfig, VisualConfig
 
@@ -53,8 +53,8 @@ class FitGeometry:
                 found = poses_from_photos(self.dataset, lens=self.lens, progress=console())
             else:
                 found = read_photos(self.dataset)
-            for note in found.notes:
-                out(f"note: {note}")
+            for text in found.notes:
+                note(text)
             roles = found.roles or ("train",) * len(found.photos)
             photos = [photo for photo, role in zip(found.photos, roles, strict=True) if role == "train"]
             with_checkpoints = checkpoints(self.out)

@@ -14,6 +14,12 @@ def out(text: str) -> None:
     sys.stdout.flush()
 
 
+def note(text: str) -> None:
+    """A remark to standard error, so that standard output stays what a program may read."""
+    sys.stderr.write(f"note: {text}\n")
+    sys.stderr.flush()
+
+
 def console() -> Console:
     """Progress on standard error: a bar on a terminal, plain lines elsewhere."""
     return Console()
