@@ -12,7 +12,6 @@ command -v git >/dev/null || need_build+=(git)
 import pathlib, sys, sysconfig
 sys.exit(not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists())
 PY
-[ -e /usr/include/hwy/highway.h ] || need_test+=(libhwy-dev)
 ls /usr/lib/*/libLLVM*19* >/dev/null 2>&1 || need_test+=(libllvm19)
 command -v chromium >/dev/null || need_test+=(chromium)
 
