@@ -439,6 +439,50 @@ def test_wrong_values_in_paths(site, capsys, name, change, message):
     assert_refused(site, capsys, site.paths, message, "spectra")
 
 
+IMPOSSIBLE = {
+    "a place that is no number": ("render FIELD --at nan 7 1 --out OUT/s.png", "NaN or infinity"),
+    "an infinite place": ("csi FIELD --at 7 inf 1", "NaN or infinity"),
+    "too many pixels": ("render FIELD --at 7 7 1 --size 99999999 99999999 --out OUT/s.png", "at most 64 million"),
+    "no pixels": ("render FIELD --at 7 7 1 --size 0 9 --out OUT/s.png", "at least one pixel"),
+    "a field of view beyond a half turn": ("render FIELD --at 7 7 1 --fov-deg 200 --out OUT/s.png", "0 and 180"),
+    "a format nobody writes": ("render FIELD --at 7 7 1 --out OUT/s.gif", ".png or .npz"),
+    "no paths": ("csi FIELD --at 7 7 1 --strongest 0", "at least 1"),
+    "a file as a folder": ("render FIELD --at 7 7 1 --size 9 9 --out PLY/s.npz", "cannot write"),
+    "a folder as a file": ("fit-geometry PICTURES --out OUT --visual.steps 1 --visual.start random", "is a folder"),
+    "a field over a file": ("fit-radio PLY SITE --out PLY", "is a file, but a field is a folder"),
+    "a field over a dataset": ("fit SITE --out SITE", "something else than a field"),
+    "a demo over a file": ("demo --scene box --out PLY", "geometry.ply"),
+    "a dataset without photographs": ("fit-geometry BARE --out OUT/g.ply", "no photographs"),
+    "negative receivers": ("trace lobby --rx-count -2 --out OUT/x.paths", "at least 1"),
+    "no photographs": ("photos lobby --count 0 --out OUT/photos", "at least 1"),
+    "an array of no elements": ("spectra PATHS --out OUT/x --method capon --array 0x4", "rows x columns"),
+    "noise without elements": ("spectra PATHS --out OUT/x --snr-db 10", "no elements"),
+    "an unknown scene": ("fit SITE --mesh nowhere --out OUT/x.field", "no scene is named"),
+    "no such dataset": ("fit OUT/gone --out OUT/x.field", "there is no dataset folder"),
+    "no such field": ("eval OUT/gone SITE --out OUT/r.html", "there is no field"),
+    "no such file": ("info OUT/gone", "there is no such file"),
+}
+
+
+@pytest.mark.parametrize("name", IMPOSSIBLE)
+def test_impossible_wishes(site, capsys, name):
+    words, message = IMPOSSIBLE[name]
+    if "BARE" in words:
+        Dataset((), make_spectra()).save(site.root / "bare")
+    places = {"FIELD": site.field, "OUT": site.out, "PLY": site.geometry, "PICTURES": site.photos}
+    places |= {"SITE": site.dataset, "PATHS": site.paths, "BARE": site.root / "bare"}
+    for word, place in places.items():
+        words = words.replace(word, str(place))
+    before = listing(site.root)
+    assert main(words.split()) == 2
+    said = capsys.readouterr()
+    last = said.err.splitlines()[-1]
+    assert last.startswith("rf3dgs: ")
+    assert message in last
+    assert "Traceback" not in said.err
+    assert listing(site.root) == before
+
+
 def test_the_sound_site_passes_every_command(sound, tmp_path, capsys):
     shutil.copytree(sound.root, tmp_path / "work")
     site = Site(tmp_path / "work")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from rf3dgs.channel.paths import Paths
+from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid
 from rf3dgs.core.progress import Progress
@@ -80,6 +81,8 @@ def make_dataset(
     spectra = spectra_of_scene(scene, rx, grid, trace, progress)
     split = Dataset((), spectra).split(seed=seed)
     index = torch.cat((split.where("test"), split.where("region")))
+    if not len(index):
+        raise InputError(f"{receivers} receivers are too few to hold some out; take at least 10")
     again = replace(trace, seed=trace.seed + REPEAT_SEED, rays=round(trace.rays * REPEAT_RAYS))
     repeat = spectra_of_scene(scene, rx[index], grid, again, progress)
     meta = {

@@ -46,6 +46,8 @@ class FitGeometry:
         from rf3dgs.splats.ply import write_ply
         from rf3dgs.training.visual import fit_geometry
 
+        if self.out.is_dir():
+            raise InputError(f"{self.out} is a folder; name the .ply file to write with --out")
         if self.mesh is not None:
             geometry = _from_mesh(self.mesh, self.mesh_count, self.visual.seed)
         else:
@@ -117,6 +119,7 @@ class Fit:
         from rf3dgs.training.visual import fit_geometry
 
         dataset = open_dataset(self.dataset)
+        check_output(self.out)
         training_spectra(dataset)
         if self.mesh is not None:
             geometry = _from_mesh(self.mesh, self.mesh_count, self.visual.seed)
@@ -144,6 +147,7 @@ def fit_field(
 
     from rf3dgs.training.radio import fit_radio
 
+    check_output(path)
     spectra = training_spectra(dataset)
     check_world(geometry, spectra.pose.position, source)
     spectra = replace(spectra, tx=None) if estimate_tx else spectra
@@ -153,6 +157,14 @@ def fit_field(
     drop_checkpoints(path)
     size = sum(file.stat().st_size for file in path.iterdir()) / 1e6
     out(f"{path}: {len(trained.surface):,} Gaussians, {size:.1f} MB")
+
+
+def check_output(path: Path) -> None:
+    """Refuse, before any training, a name where no field can be written."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path} is a file, but a field is a folder; choose another name with --out")
+    if path.is_dir() and any(path.iterdir()) and not (path / "field.json").exists():
+        raise InputError(f"{path} is a folder that holds something else than a field; choose another name with --out")
 
 
 def training_spectra(dataset: "Dataset") -> "Spectrum":

@@ -68,3 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"rf3dgs: {where}{error.strerror or error}; check the name, its folder and free space", file=sys.stderr)  # noqa: T201
+        return 2

@@ -35,6 +35,8 @@ class Trace:
         from rf3dgs.cli.facts import open_scene
         from rf3dgs.propagation.sionna import trace_each
 
+        if self.rx_count < 1:
+            raise InputError(f"--rx-count must be at least 1; got {self.rx_count}")
         scene = open_scene(self.scene)
         rx = scene.receivers(self.rx_count, self.rx_seed)
         frequency = self.trace.frequency or scene.frequency
@@ -69,6 +71,8 @@ class MakePhotos:
         from rf3dgs.core.files import atomic_folder
         from rf3dgs.data.formats.nerfstudio import write_nerfstudio
 
+        if self.count < 1:
+            raise InputError(f"--count must be at least 1; got {self.count}")
         scene = open_scene(self.scene)
         with atomic_folder(self.out) as folder:
             photos = photograph(scene, self.count, self.tour_seed, self.photo, folder, console())

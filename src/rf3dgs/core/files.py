@@ -15,7 +15,8 @@ from pathlib import Path
 
 from rf3dgs.core.errors import DataError
 
-_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG, errno.ENOTDIR}
+_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG, errno.ENAMETOOLONG}
+_DISK_ERRORS |= {errno.ENOTDIR, errno.EEXIST, errno.EISDIR}  # a file where a folder should be, or the other way round
 
 
 @contextmanager

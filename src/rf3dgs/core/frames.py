@@ -120,6 +120,8 @@ class Pose:
         position = torch.as_tensor(position, dtype=torch.float32)
         forward = torch.as_tensor(target, dtype=torch.float32) - position
         distance = torch.linalg.vector_norm(forward, dim=-1, keepdim=True)
+        if not bool(torch.isfinite(distance).all()):
+            raise InputError("look_at needs finite numbers [m]; position or target has NaN or infinity")
         if not bool((distance > 1e-6).all()):
             raise InputError("look_at needs a target away from the position; both are the same point")
         forward = forward / distance

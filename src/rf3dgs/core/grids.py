@@ -14,6 +14,7 @@ from rf3dgs.core.angles import angles_of, direction_of
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import CAMERA_FROM_DEVICE, Pose
 
+MAX_PIXELS = 64_000_000
 GridKind = Literal["pinhole", "equirect", "list"]
 
 
@@ -124,6 +125,8 @@ def list_grid(directions: Tensor, solid_angle: Tensor | None = None) -> Directio
 def _check_size(width: int, height: int) -> None:
     if width < 1 or height < 1:
         raise InputError(f"a grid needs at least one pixel each way; got {width}x{height}")
+    if width * height > MAX_PIXELS:
+        raise InputError(f"a grid has at most {MAX_PIXELS // 10**6} million pixels; got {width}x{height}")
 
 
 @dataclass(frozen=True, eq=False)

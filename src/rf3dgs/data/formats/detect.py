@@ -34,6 +34,8 @@ def read_photos(path: str | Path) -> PhotoSet:
     layout = layout_of(path)
     if layout in ("native", "nerfstudio"):
         folder = path if (path / FILE_NAME).is_file() else path / "photos"
+        if not (folder / FILE_NAME).is_file():
+            raise DataError(f"{path}: this dataset has no photographs; add some, or take the geometry from a mesh")
         found = read_nerfstudio(folder)
         return PhotoSet(found.photos, layout, notes=found.notes)
     if layout == "blender":
