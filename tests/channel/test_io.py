@@ -1,3 +1,5 @@
+import subprocess
+import sys
 from dataclasses import replace
 
 import h5py
@@ -9,6 +11,7 @@ from rf3dgs.channel.binning import stack_paths
 from rf3dgs.channel.io import PathsReader, PathsWriter, load_paths, save_paths
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose
+from rf3dgs.core.hdf5 import open_audited, read_attribute, write_text
 
 COLUMNS = ("coeff", "delay", "aoa_zenith", "aoa_azimuth", "aod_zenith", "aod_azimuth", "valid", "order", "kind")
 
@@ -56,11 +59,11 @@ def test_a_failed_writer_leaves_nothing_and_keeps_the_older_file(paths, tmp_path
 
 def test_the_file_states_its_conventions(paths, tmp_path):
     save_paths(paths, tmp_path / "a.paths")
-    with h5py.File(tmp_path / "a.paths") as file:
-        assert file.attrs["schema"] == "rf3dgs.paths"
+    with open_audited(tmp_path / "a.paths") as file:
+        assert read_attribute(file, "schema") == "rf3dgs.paths"
         assert file.attrs["version"] == 1
-        assert "zenith" in file.attrs["angles"]
-        assert "rad" in file.attrs["units"]
+        assert "zenith" in str(read_attribute(file, "angles"))
+        assert "rad" in str(read_attribute(file, "units"))
         assert file.attrs["frequency"] == 60e9
         assert file["delay"].compression == "gzip"
         assert file["delay"].shuffle
@@ -97,6 +100,46 @@ def test_flipped_bytes_never_crash_and_never_change_a_column_unnoticed(paths, tm
         assert torch.equal(loaded.rx.position, paths.rx.position)
 
 
+DAMAGE = """
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from rf3dgs.channel.io import load_paths
+from rf3dgs.core.errors import DataError
+
+path, random, refused = Path(sys.argv[1]), np.random.default_rng(0), 0
+whole = path.read_bytes()
+for _ in range(150):
+    raw = bytearray(whole)
+    for place in random.integers(0, len(raw), 8):
+        raw[place] = random.integers(256)
+    path.write_bytes(raw)
+    try:
+        load_paths(path)
+    except DataError:
+        refused += 1
+print(refused)
+"""
+
+
+def test_random_damage_never_hangs_or_crashes(paths, tmp_path):
+    file = tmp_path / "a.paths"
+    save_paths(paths, file, meta={"seed": 3, "scene": "lobby"})
+    # A process of its own: damage that makes the library hang or crash fails this test and no other.
+    done = subprocess.run([sys.executable, "-c", DAMAGE, str(file)], capture_output=True, text=True, timeout=180)
+    assert done.returncode == 0, done.stderr
+    assert 100 < int(done.stdout) <= 150
+
+
+def test_meta_too_long_for_the_file_is_refused_before_anything_is_traced(paths, tmp_path):
+    writer = PathsWriter(tmp_path / "a.paths", 60e9, paths.tx, {"note": "x" * 60_000})
+    with pytest.raises(InputError, match="'meta' must take at most"), writer:
+        pytest.fail("the writer must not open")
+    assert not list(tmp_path.iterdir())
+
+
 def test_external_links_are_refused(paths, tmp_path):
     save_paths(paths, tmp_path / "a.paths")
     with h5py.File(tmp_path / "a.paths", "a") as file:
@@ -118,13 +161,15 @@ def test_a_small_file_that_declares_terabytes_is_refused(paths, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda file: file.attrs.__setitem__("schema", "other"), "expected a file of paths"),
+        (lambda file: write_text(file.attrs, "schema", "other"), "expected a file of paths"),
+        (lambda file: file.attrs.__delitem__("schema"), "expected a file of paths"),
+        (lambda file: file.attrs.__setitem__("schema", "rf3dgs.paths"), "'schema' of '/' has variable length"),
         (lambda file: file.attrs.__setitem__("version", 2), "schema version 2"),
         (lambda file: file.__delitem__("delay"), "'delay' must have"),
         (lambda file: file["offset"].__setitem__(1, 10**6), "'offset' must rise"),
         (lambda file: file["delay"].__setitem__(0, np.nan), "'delay' has NaN"),
         (lambda file: file["rx_orientation"].__setitem__(0, 0.0), "zero or non-finite quaternion"),
-        (lambda file: file.attrs.__setitem__("meta", "{"), "head is damaged"),
+        (lambda file: write_text(file.attrs, "meta", "{"), "head is damaged"),
     ],
 )
 def test_damage_is_told_in_one_sentence_with_the_file(paths, tmp_path, change, message):

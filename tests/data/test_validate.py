@@ -7,6 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
+from rf3dgs.core.hdf5 import write_text
 from rf3dgs.data.dataset import Dataset
 from rf3dgs.data.formats.colmap import write_colmap
 from rf3dgs.data.formats.nerfstudio import write_nerfstudio
@@ -55,13 +56,14 @@ def _codes(name, change):
 
 
 def _attribute(where, name, value):
-    return lambda file: file[where].attrs.__setitem__(name, value)
+    stored = np.bytes_(value.encode()) if isinstance(value, str) else value
+    return lambda file: file[where].attrs.__setitem__(name, stored)
 
 
 def _fewer_poses(file):
     position = file["spectra/position"][()]
     del file["spectra/position"]
-    file["spectra"].create_dataset("position", data=position[:-1]).attrs["unit"] = "m"
+    write_text(file["spectra"].create_dataset("position", data=position[:-1]).attrs, "unit", "m")
 
 
 def _external_link(file):

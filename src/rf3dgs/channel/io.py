@@ -3,7 +3,9 @@
 Layout, version 1. `offset` `[rx + 1]`: the paths of receiver i are the entries `offset[i]` to `offset[i + 1]` of every
 column. Columns: `coeff_real`, `coeff_imag`, `delay` [s], `aoa_zenith`, `aoa_azimuth`, `aod_zenith`, `aod_azimuth`
 [rad], and, where known, `order` and `kind`. `rx_position` `[rx, 3]` [m], `rx_orientation` `[rx, 4]` (wxyz). The columns
-are compressed by gzip and shuffle; every dataset carries fletcher32 checksums. MATLAB reads such a file with `h5read`.
+are compressed by gzip and shuffle; every dataset carries fletcher32 checksums, and the file format of HDF5 1.10 has
+checksums of everything else, so that damage is noticed. Text attributes are fixed-length UTF-8. Any program with HDF5
+1.10 or later reads such a file, MATLAB with `h5read`.
 """
 
 import json
@@ -21,7 +23,7 @@ from rf3dgs.channel.paths import Paths
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.files import atomic_file
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.hdf5 import open_audited, read_array, read_attribute
+from rf3dgs.core.hdf5 import LIBVER, open_audited, read_array, read_attribute, write_text
 
 SCHEMA = "rf3dgs.paths"
 VERSION = 1
@@ -43,7 +45,7 @@ class PathsWriter:
     """
 
     def __init__(self, path: str | Path, frequency: float, tx: Pose, meta: Mapping[str, object] | None = None) -> None:
-        """Open `path` for paths at `frequency` [Hz] from `tx` (one pose); `meta` is anything JSON can hold."""
+        """Open `path` for paths at `frequency` [Hz] from `tx` (one pose); `meta` is what JSON can hold in 60 kB."""
         if tx.batch_shape:
             raise InputError(f"tx must be one pose; got {list(tx.batch_shape)} of them")
         self.path = Path(path)
@@ -57,8 +59,14 @@ class PathsWriter:
         self._rx: list[Pose] = []
 
     def __enter__(self) -> "PathsWriter":
-        temporary = self._stack.enter_context(atomic_file(self.path))
-        self._file = self._stack.enter_context(h5py.File(temporary, "w"))
+        with ExitStack() as stack:
+            temporary = stack.enter_context(atomic_file(self.path))
+            file = stack.enter_context(h5py.File(temporary, "w", libver=LIBVER))
+            for name, text in {**CONVENTIONS, "schema": SCHEMA, "meta": self._meta}.items():
+                write_text(file.attrs, name, text)
+            file.attrs["version"] = VERSION
+            file.attrs["frequency"] = self.frequency
+            self._file, self._stack = file, stack.pop_all()
         return self
 
     def append(self, paths: Paths) -> None:
@@ -130,11 +138,6 @@ class PathsWriter:
         }
         for name, value in head.items():
             file.create_dataset(name, data=value, fletcher32=True)
-        file.attrs.update(CONVENTIONS)
-        file.attrs["schema"] = SCHEMA
-        file.attrs["version"] = VERSION
-        file.attrs["frequency"] = self.frequency
-        file.attrs["meta"] = self._meta
 
 
 def _columns(paths: Paths) -> dict[str, np.ndarray]:
@@ -180,18 +183,20 @@ class PathsReader:
 
     def _read_head(self) -> None:
         file = self._file
-        if file.attrs.get("schema") != SCHEMA:
-            raise DataError(f"{self.path}: expected a file of paths with schema {SCHEMA!r}; it holds something else")
-        version = read_attribute(file, "version")
-        if version != VERSION:
-            raise DataError(f"{self.path}: schema version {version} is not {VERSION}; update rf3dgs to read it")
         try:
+            if "schema" not in file.attrs or read_attribute(file, "schema") != SCHEMA:
+                raise DataError(
+                    f"{self.path}: expected a file of paths with schema {SCHEMA!r}; it holds something else"
+                )
+            version = read_attribute(file, "version")
+            if version != VERSION:
+                raise DataError(f"{self.path}: schema version {version} is not {VERSION}; update rf3dgs to read it")
             self.frequency = float(read_attribute(file, "frequency"))
             self.meta: dict = json.loads(str(read_attribute(file, "meta")))
             self._offset = read_array(file, "offset").astype(np.int64)
             self.tx = Pose(*self._pose("tx", ()))
             self.rx = Pose(*self._pose("rx", (len(self._offset) - 1,)))
-        except (InputError, ValueError, TypeError, RecursionError) as error:
+        except (InputError, ValueError, TypeError, OSError, RuntimeError) as error:
             raise DataError(f"{self.path}: its head is damaged ({error}); write it again") from error
         offset = self._offset
         if offset.ndim != 1 or len(offset) < 2 or offset[0] != 0 or bool((np.diff(offset) < 0).any()):

@@ -1,8 +1,10 @@
 """Opening HDF5 files of unknown origin: what a file declares is audited before a single value is read.
 
 A foreign HDF5 file can name any local file as its storage, link to other files, ask for a filter plug-in, or declare
-terabytes in a kilobyte. This module accepts groups and plain arrays of numbers with gzip, shuffle and fletcher32, and
-nothing else.
+terabytes in a kilobyte; a damaged reference to text of variable length, or a damaged list of names in the file format
+before HDF5 1.10, which has no checksums, can keep the library busy for ever. This module accepts the format of HDF5
+1.10 (`LIBVER`) with groups, plain arrays of numbers with gzip, shuffle and fletcher32, and attributes that are numbers
+or text of fixed length, and nothing else.
 """
 
 from collections.abc import Iterator
@@ -12,12 +14,16 @@ import h5py
 import h5py.h5o
 import numpy as np
 
-from rf3dgs.core.errors import DataError
+from rf3dgs.core.errors import DataError, InputError
 
+LIBVER = ("v110", "v110")  # h5py's `libver` for files to be written
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+MIN_SUPERBLOCK = 3  # its structure has checksums throughout
 MAX_OBJECTS = 10_000
 MAX_DEPTH = 16
 MAX_ATTRIBUTES = 256
 MAX_ATTRIBUTE_BYTES = 65_536
+MAX_TEXT_BYTES = 60_000  # what an HDF5 object header takes in one attribute, with room for its name
 MAX_RATIO = 200  # declared bytes per byte of the file
 ALWAYS_ALLOWED = 64 * 2**20  # declared bytes that need no ratio: constant arrays compress a thousandfold
 _NUMBERS = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.ENUM)
@@ -27,15 +33,16 @@ _FILTERS = (h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FL
 def open_audited(path: str | Path, *, max_bytes: int = 8 * 2**30) -> h5py.File:
     """Open an HDF5 file for reading after an audit of everything in it; use it in a `with` statement.
 
-    Refused with a `DataError` that names the file: what is not HDF5 or is truncated; soft and external links; external
-    or virtual storage; compound, variable-length, reference and other types than numbers (a scalar text is allowed as
-    an attribute); filters other than gzip, shuffle and fletcher32; more than `max_bytes` declared, or more than 200
-    times the file's size.
+    Refused with a `DataError` that names the file: what is not HDF5 or is truncated; the file format before HDF5 1.10;
+    soft and external links; external or virtual storage; compound, variable-length, reference and other types than
+    numbers (text of fixed length is allowed as an attribute); filters other than gzip, shuffle and fletcher32; more
+    than `max_bytes` declared, or more than 200 times the file's size.
     """
     path = Path(path)
     if not path.is_file():
         raise DataError(f"{path}: expected an HDF5 file; there is no such file")
     try:
+        _check_format(path)
         file = h5py.File(path, "r", locking="best-effort")
     except (OSError, RuntimeError, ValueError) as error:
         raise DataError(f"{path}: expected an HDF5 file; it is damaged, truncated or another format") from error
@@ -62,6 +69,16 @@ def read_array(group: h5py.Group, name: str) -> np.ndarray:
         raise DataError(f"{path}: {where!r} is damaged (checksum or storage); write the file again") from error
 
 
+def write_text(attrs: h5py.AttributeManager, name: str, text: str) -> None:
+    """Set an attribute to text as fixed-length UTF-8, the only form of text that `open_audited` accepts."""
+    raw = text.encode("utf-8")
+    if len(raw) > MAX_TEXT_BYTES:
+        raise InputError(
+            f"the attribute {name!r} must take at most {MAX_TEXT_BYTES} bytes as UTF-8; got {len(raw)}: shorten it"
+        )
+    attrs.create(name, np.array(raw, dtype=h5py.string_dtype("utf-8", max(1, len(raw)))))
+
+
 def read_attribute(item: h5py.HLObject, name: str) -> str | float | int | np.ndarray:
     """One attribute as text, number or small array; a missing one is a `DataError` that names file and object."""
     try:
@@ -77,6 +94,19 @@ def read_attribute(item: h5py.HLObject, name: str) -> str | float | int | np.nda
         return value
     array = np.asarray(value)
     return array.item() if array.ndim == 0 else array
+
+
+def _check_format(path: Path) -> None:
+    """Refuse, before the library sees it, a file whose structure has no checksums."""
+    with path.open("rb") as file:
+        head = file.read(len(SIGNATURE) + 1)
+    if len(head) <= len(SIGNATURE) or not head.startswith(SIGNATURE):
+        raise ValueError("no signature of HDF5 at the beginning")
+    if head[-1] < MIN_SUPERBLOCK:
+        raise DataError(
+            f"{path}: is in the file format before HDF5 1.10, which has no checksums, so that damage can make reading "
+            "hang; write it in the format of 1.10 (h5py: File(name, 'w', libver='v110'))"
+        )
 
 
 def _audit(file: h5py.File, path: Path, max_bytes: int) -> None:
@@ -146,12 +176,15 @@ def _audit_attributes(item: h5py.Group | h5py.Dataset, path: Path, name: str) ->
     for index in range(count):
         attribute = h5py.h5a.open(item.id, index=index)
         kind = attribute.get_type()
+        label = attribute.name.decode("utf-8", errors="replace")
         text = isinstance(kind, h5py.h5t.TypeStringID)
+        if (text and kind.is_variable_str()) or kind.detect_class(h5py.h5t.VLEN):
+            raise DataError(
+                f"{path}: attribute {label!r} of {name!r} has variable length, which is not safe to read; "
+                "store it as fixed-length text (h5py: attrs[name] = numpy.bytes_(text.encode())) or a plain array"
+            )
         size = _product(attribute.shape) * kind.get_size()
-        if text and kind.is_variable_str():
-            size = 0 if attribute.shape == () else MAX_ATTRIBUTE_BYTES + 1
         if size > MAX_ATTRIBUTE_BYTES or not (text or kind.get_class() in _NUMBERS):
-            label = attribute.name.decode("utf-8", errors="replace")
             raise DataError(f"{path}: attribute {label!r} of {name!r} must be one text or a few numbers")
 
 

@@ -2,7 +2,7 @@
 
 Every array says in its attributes `scale`, `offset`, `unit` and `missing` how a stored integer becomes a value:
 `integer * scale + offset`, and no value where it equals `missing`. Departures are unit vectors in the octahedral map:
-two components in [-1, 1], stored one after the other (`aod` `[position, 2, row, col]`).
+two components in [-1, 1], stored one after the other (`aod` `[position, 2, row, col]`). Text is fixed-length UTF-8.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ from torch import Tensor
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid, list_grid, pinhole_grid
-from rf3dgs.core.hdf5 import open_audited, read_array, read_attribute
+from rf3dgs.core.hdf5 import LIBVER, open_audited, read_array, read_attribute, write_text
 from rf3dgs.core.units import power_from_db
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 
@@ -56,9 +56,11 @@ def write_spectra(
     """
     how = how or Precision()
     meta = meta or {}
-    with h5py.File(path, "w", libver=("earliest", "v110")) as file:
-        file.attrs["schema"], file.attrs["version"] = SCHEMA, VERSION
-        file.attrs["generator"], file.attrs["seed"] = str(meta.get("generator", "")), str(meta.get("seed", ""))
+    with h5py.File(path, "w", libver=LIBVER) as file:
+        write_text(file.attrs, "schema", SCHEMA)
+        file.attrs["version"] = VERSION
+        for name in ("generator", "seed"):
+            write_text(file.attrs, name, str(meta.get(name, "")))
         _write_group(file.create_group("spectra"), spectra, how)
         if repeat is not None and index is not None:
             group = file.create_group("repeat")
@@ -98,11 +100,11 @@ def _write_group(group: h5py.Group, spectrum: Spectrum, how: Precision) -> None:
         raise InputError(f"spectra to be saved must be [position, row, col]; got {list(spectrum.power.shape)}")
     if not bool(torch.isfinite(spectrum.power).all()) or bool((spectrum.power < 0).any()):
         raise InputError("spectra to be saved must have finite, non-negative power; check what made them")
-    group.attrs["method"] = spectrum.method
-    group.attrs["frequency"], group.attrs["frequency_unit"] = spectrum.frequency, "Hz"
-    group.attrs["instrument"] = spectrum.instrument.name
-    group.attrs["lobe"], group.attrs["lobe_unit"] = spectrum.instrument.lobe, "rad"
-    group.attrs["beam_solid_angle"], group.attrs["beam_solid_angle_unit"] = spectrum.instrument.beam_solid_angle, "sr"
+    write_text(group.attrs, "method", spectrum.method)
+    write_text(group.attrs, "instrument", spectrum.instrument.name)
+    _write_quantity(group, "frequency", spectrum.frequency, "Hz")
+    _write_quantity(group, "lobe", spectrum.instrument.lobe, "rad")
+    _write_quantity(group, "beam_solid_angle", spectrum.instrument.beam_solid_angle, "sr")
     _write_grid(group, spectrum.grid)
     _write_pose(group, "", spectrum.pose)
     if spectrum.tx is not None:
@@ -116,6 +118,11 @@ def _write_group(group: h5py.Group, spectrum: Spectrum, how: Precision) -> None:
         components = np.moveaxis(octahedral_of(spectrum.aod.double().numpy()), -1, 1)
         known = np.repeat(some[:, None], 2, axis=1)
         _write_scaled(group, "aod", components, known, step=how.aod, unit="octahedral", low=-1.0)
+
+
+def _write_quantity(group: h5py.Group, name: str, value: float | np.ndarray, unit: str) -> None:
+    group.attrs[name] = value
+    write_text(group.attrs, f"{name}_unit", unit)
 
 
 def _write_scaled(
@@ -143,8 +150,8 @@ def _write_scaled(
     dataset = group.create_dataset(
         name, data=codes, chunks=chunk, compression="gzip", compression_opts=9, shuffle=True, fletcher32=True
     )
-    dataset.attrs["scale"], dataset.attrs["offset"] = scale, offset
-    dataset.attrs["unit"], dataset.attrs["missing"] = unit, 0
+    dataset.attrs["scale"], dataset.attrs["offset"], dataset.attrs["missing"] = scale, offset, 0
+    write_text(dataset.attrs, "unit", unit)
 
 
 def _read_scaled(group: h5py.Group, name: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
@@ -210,7 +217,7 @@ def _write_pose(group: h5py.Group, prefix: str, pose: Pose) -> None:
     units = {"position": "m", "orientation": "quaternion wxyz, world_from_device"}
     for name, unit in units.items():
         values = getattr(pose, name).contiguous().numpy()
-        group.create_dataset(prefix + name, data=values, track_times=False).attrs["unit"] = unit
+        write_text(group.create_dataset(prefix + name, data=values, track_times=False).attrs, "unit", unit)
 
 
 def _read_pose(group: h5py.Group, prefix: str) -> Pose:
@@ -221,13 +228,15 @@ def _read_pose(group: h5py.Group, prefix: str) -> Pose:
 
 
 def _write_grid(group: h5py.Group, grid: DirectionGrid) -> None:
-    group.attrs["grid"], group.attrs["rows"], group.attrs["cols"] = grid.kind, grid.height, grid.width
+    write_text(group.attrs, "grid", grid.kind)
+    group.attrs["rows"], group.attrs["cols"] = grid.height, grid.width
     if grid.K is not None:
-        group.attrs["K"], group.attrs["K_unit"] = grid.K.numpy(), "pixel"
+        _write_quantity(group, "K", grid.K.numpy(), "pixel")
     if grid.kind == "list":
         directions = group.create_dataset("directions", data=grid.directions[0].numpy(), track_times=False)
-        directions.attrs["unit"] = "unit vector, device frame"
-        group.create_dataset("solid_angle", data=grid.solid_angle[0].numpy(), track_times=False).attrs["unit"] = "sr"
+        write_text(directions.attrs, "unit", "unit vector, device frame")
+        solid_angle = group.create_dataset("solid_angle", data=grid.solid_angle[0].numpy(), track_times=False)
+        write_text(solid_angle.attrs, "unit", "sr")
 
 
 def _read_grid(group: h5py.Group) -> DirectionGrid:
