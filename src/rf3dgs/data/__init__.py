@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rf3dgs.data.formats.spectra_h5 import Precision as Precision
     from rf3dgs.data.photo import Photo as Photo
     from rf3dgs.data.photo import PhotoSet as PhotoSet
+    from rf3dgs.data.sfm import poses_from_photos as poses_from_photos
     from rf3dgs.data.split import split_positions as split_positions
     from rf3dgs.data.validate import Fault as Fault
 
@@ -38,6 +39,7 @@ _MODULES = {
     "write_nerfstudio": ".formats.nerfstudio",
     "read_blender": ".formats.blender",
     "read_rf3dgs_v0": ".formats.rf3dgs_v0",
+    "poses_from_photos": ".sfm",
     "Similarity": ".align",
     "Fault": ".validate",
 }
@@ -55,6 +57,7 @@ __all__ = [  # noqa: RUF022
     "write_nerfstudio",
     "read_blender",
     "read_rf3dgs_v0",
+    "poses_from_photos",
     "Similarity",
     "Fault",
 ]
