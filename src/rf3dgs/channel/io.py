@@ -9,6 +9,7 @@ checksums of everything else, so that damage is noticed. Text attributes are fix
 """
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -24,10 +25,12 @@ from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.files import atomic_file
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.hdf5 import LIBVER, open_audited, read_array, read_attribute, write_text
+from rf3dgs.core.units import SPEED_OF_LIGHT
 
 SCHEMA = "rf3dgs.paths"
 VERSION = 1
 CHUNK = 65_536
+MAX_DELAY = 1e-3  # [s] the way of light over 300 km
 FLOATS = ("coeff_real", "coeff_imag", "delay", "aoa_zenith", "aoa_azimuth", "aod_zenith", "aod_azimuth")
 INTEGERS = ("order", "kind")
 CONVENTIONS = {
@@ -228,6 +231,7 @@ class PathsReader:
         index %= len(self)
         part = slice(int(self._offset[index]), int(self._offset[index + 1]))
         columns = {name: self._column(name, part) for name in self._datasets}
+        self._check_units(columns, index)
         coeff = torch.complex(columns.pop("coeff_real"), columns.pop("coeff_imag"))
         valid = torch.ones(coeff.shape, dtype=torch.bool)
         return Paths(coeff=coeff, **columns, valid=valid, frequency=self.frequency, tx=self.tx, rx=self.rx[index])
@@ -242,6 +246,25 @@ class PathsReader:
         if not np.isfinite(value).all():
             raise DataError(f"{self.path}: {name!r} has NaN or infinite values; write the file again")
         return torch.from_numpy(value.astype(np.float32))
+
+    def _check_units(self, columns: Mapping[str, torch.Tensor], index: int) -> None:
+        """Refuse angles beyond a full turn, and delays that light does not have over the distance."""
+        if not len(columns["delay"]):
+            return
+        for name, limit in {"aoa_zenith": 1, "aoa_azimuth": 2, "aod_zenith": 1, "aod_azimuth": 2}.items():
+            largest = float(columns[name].abs().max())
+            if largest > limit * math.pi + 1e-3:
+                raise DataError(
+                    f"{self.path}: {name!r} of receiver {index} reaches {largest:.4g}, expected at most {limit} pi "
+                    "radians; it is in degrees, convert it to radians"
+                )
+        first, last = float(columns["delay"].min()), float(columns["delay"].max())
+        distance = float(torch.linalg.vector_norm(self.rx[index].position - self.tx.position))
+        if last > MAX_DELAY or first * SPEED_OF_LIGHT < 0.9 * distance - 0.05:
+            raise DataError(
+                f"{self.path}: receiver {index}, {distance:.4g} m from the transmitter, has delays from {first:.3g} to "
+                f"{last:.3g} s, which light does not; positions must be in metres and delays in seconds, convert them"
+            )
 
     def __iter__(self) -> Iterator[Paths]:
         return (self[index] for index in range(len(self)))
