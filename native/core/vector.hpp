@@ -125,13 +125,28 @@ RF_INLINE Vec float_bits(const IntVec& value) {
 
 RF_INLINE Vec splat_vec(float value) { return Vec{} + value; }
 
+#if defined(__AVX512F__)
+
 RF_INLINE Vec load(const float* from) {
   Vec result;
   std::memcpy(&result, from, sizeof(result));
   return result;
 }
+RF_INLINE void store(float* to, const Vec& value) { std::memcpy(to, &value, sizeof(value)); }
 
-RF_INLINE void store(float* to, Vec value) { std::memcpy(to, &value, sizeof(value)); }
+#else
+
+// A copy of several registers at once would go through memory.
+RF_INLINE Vec load(const float* from) {
+  Vec result;
+  RF_EACH_PART std::memcpy(&result.part[at], from + at * (kLanes / kParts), sizeof(FloatPart));
+  return result;
+}
+RF_INLINE void store(float* to, const Vec& value) {
+  RF_EACH_PART std::memcpy(to + at * (kLanes / kParts), &value.part[at], sizeof(FloatPart));
+}
+
+#endif
 
 RF_INLINE Vec min_vec(Vec a, Vec b) { return select(a < b, a, b); }
 RF_INLINE Vec max_vec(Vec a, Vec b) { return select(a > b, a, b); }

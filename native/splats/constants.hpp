@@ -13,6 +13,7 @@ constexpr float kFieldClamp = 1.3f;           // the Jacobian's x/z and y/z stay
 constexpr float kMinQuaternionNorm = 1e-12f;  // shorter quaternions have no direction
 
 constexpr int kSsimRadius = 5;                // pixels
+constexpr int kSsimTaps = 2 * kSsimRadius + 1;
 constexpr float kSsimSigma = 1.5f;            // pixels
 constexpr float kSsimC1 = 0.01f * 0.01f;
 constexpr float kSsimC2 = 0.03f * 0.03f;

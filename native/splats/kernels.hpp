@@ -6,6 +6,8 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "splats/constants.hpp"
+
 namespace rf3dgs {
 
 // A pinhole camera: camera_from_world (row-major rotation, translation), focal lengths and centre in pixels.
@@ -69,6 +71,26 @@ struct Tile {
   const float* background;  // [channels] or null
 };
 
+// Two pictures [row, col, channel] to be compared, with an optional weight [row, col].
+struct PicturePair {
+  const float* a;
+  const float* b;
+  const float* weight;
+  const float* window;  // [kSsimTaps]
+  int height, width, channels;
+};
+
+// A row's sums of weight * SSIM and weight * |a - b| over columns and channels.
+struct LossSums {
+  float ssim, l1;
+};
+
+// Floats of a row in whole vectors, and of a row with the window's reach on both sides.
+constexpr int loss_stride(int width, int channels) { return (width * channels + 15) / 16 * 16; }
+constexpr int loss_line(int width, int channels) {
+  return loss_stride(width, channels) + 2 * kSsimRadius * channels + 16;
+}
+
 struct Kernels {
   const char* name;
   // Projects Gaussians [begin, end); returns how many are visible and appends them to splats/extents.
@@ -87,15 +109,12 @@ struct Kernels {
                     float* out);
   void (*harmonics_backward)(const float* gradient, const float* directions, int bases, int channels, size_t begin,
                              size_t end, float* out);
-  // Picture similarity, a row of one channel at a time; `scratch` holds 5 (width + 32) floats.
-  // First blur a, b, aa, bb, ab along the row; then blur these planes along columns, sum weight * SSIM, and write the
-  // weighted partial derivatives with respect to the blurred a, aa and ab; last blur these both ways into the gradient.
-  void (*ssim_row)(const float* a, const float* b, int width, int channels, float* const out[5], float* scratch);
-  double (*ssim_column)(const float* const in[5], int row, int width, int height, const float* weight,
-                        float* const out[3], float* scratch);
-  void (*ssim_gradient_row)(const float* const in[3], int row, int width, int height, const float* a, const float* b,
-                            int channels, const float* weight, float l1_scale, float ssim_scale, float* gradient,
-                            float* scratch);
+  // Picture similarity, a row at a time; `scratch` holds six lines of `loss_line` floats. First sum weight * SSIM and
+  // weight * L1 and write the row's partial derivatives with respect to the blurred a, aa and ab (`loss_stride` floats
+  // each); once all rows are there, blur these both ways into the gradient.
+  LossSums (*ssim_row)(const PicturePair&, int row, float* const partial[3], float* scratch);
+  void (*ssim_gradient_row)(const PicturePair&, int row, const float* const partial[3], float l1_scale,
+                            float ssim_scale, float* gradient, float* scratch);
 };
 
 const Kernels& portable_kernels();

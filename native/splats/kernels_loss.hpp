@@ -3,6 +3,8 @@
 //   S = (2 m_a m_b + C1)(2 s_ab + C2) / ((m_a^2 + m_b^2 + C1)(s_a + s_b + C2)),  m = G * a,  s_ab = G * ab - m_a m_b.
 //
 // G is its own adjoint, so the gradient is G*(S_m) + 2 a G*(S_aa) + b G*(S_ab). Wang et al. (2004).
+// A row of all channels is one line of floats in which the window's taps lie `channels` floats apart, so pictures are
+// read as they are. Columns are blurred first: the five products of a row then live in the nearest cache only.
 #pragma once
 
 #include "core/vector.hpp"
@@ -13,113 +15,133 @@ namespace {
 
 using namespace rf3dgs;
 
-constexpr int kTaps = 2 * kSsimRadius + 1;
+// Floats of a picture's column strip one vector wide; a strip that ends beyond the picture is copied and filled with
+// zeros.
+struct Strip {
+  const float* at;  // the row that the strip starts with
+  int stride;
+  alignas(64) float copy[kSsimTaps * kLanes];
 
-struct Window {
-  float tap[kTaps];
+  RF_INLINE Strip(const float* picture, int first, int rows, int length, int x) {
+    at = picture + static_cast<size_t>(first) * length + x;
+    stride = length;
+    if (length - x >= kLanes) return;
+    for (int row = 0; row < rows; ++row) {
+      for (int lane = 0; lane < kLanes; ++lane) {
+        copy[row * kLanes + lane] = x + lane < length ? at[static_cast<size_t>(row) * length + lane] : 0.0f;
+      }
+    }
+    at = copy;
+    stride = kLanes;
+  }
+  RF_INLINE Vec operator[](int row) const { return load(at + static_cast<size_t>(row) * stride); }
 };
 
-RF_INLINE Window ssim_window() {
-  Window window;
-  double total = 0.0;
-  for (int at = 0; at < kTaps; ++at) {
-    const double distance = at - kSsimRadius;
-    total += __builtin_exp(-0.5 * distance * distance / (double(kSsimSigma) * kSsimSigma));
+// The lines of scratch memory, with the window's reach of zeros on both sides.
+struct Lines {
+  float* first;
+  int reach, stride;
+
+  RF_INLINE float* operator[](int line) const { return first + line * stride + reach; }
+};
+
+RF_INLINE Lines zero_sided_lines(const PicturePair& pair, int count, float* scratch) {
+  const Lines lines = {scratch, kSsimRadius * pair.channels, loss_line(pair.width, pair.channels)};
+  for (int line = 0; line < count; ++line) {
+    std::memset(lines[line] - lines.reach, 0, lines.reach * sizeof(float));
+    std::memset(lines[line] + pair.width * pair.channels, 0, (lines.reach + kLanes) * sizeof(float));
   }
-  for (int at = 0; at < kTaps; ++at) {
-    const double distance = at - kSsimRadius;
-    window.tap[at] =
-        static_cast<float>(__builtin_exp(-0.5 * distance * distance / (double(kSsimSigma) * kSsimSigma)) / total);
-  }
-  return window;
+  return lines;
 }
 
-// `padded` holds kSsimRadius zeros on both sides of the row.
-RF_INLINE void blur_row(const Window& window, const float* __restrict padded, int width, float* __restrict out) {
-  for (int x = 0; x < width; ++x) {
-    float sum = 0.0f;
-    for (int at = 0; at < kTaps; ++at) sum += window.tap[at] * padded[x + at];
-    out[x] = sum;
-  }
-}
-
-RF_INLINE void blur_column(const Window& window, const float* plane, int row, int width, int height,
-                           float* __restrict out) {
-  for (int x = 0; x < width; ++x) out[x] = 0.0f;
-  for (int at = 0; at < kTaps; ++at) {
-    const int from = row + at - kSsimRadius;
-    if (from < 0 || from >= height) continue;
-    const float* __restrict line = plane + static_cast<size_t>(from) * width;
-    const float tap = window.tap[at];
-    for (int x = 0; x < width; ++x) out[x] += tap * line[x];
+// The weight of every float of a row.
+RF_INLINE void write_shares(const PicturePair& pair, int row, float* shares) {
+  const float* weight = pair.weight == nullptr ? nullptr : pair.weight + static_cast<size_t>(row) * pair.width;
+  for (int x = 0; x < pair.width; ++x) {
+    for (int channel = 0; channel < pair.channels; ++channel) {
+      shares[x * pair.channels + channel] = weight == nullptr ? 1.0f : weight[x];
+    }
   }
 }
 
-void ssim_row(const float* a, const float* b, int width, int channels, float* const out[5], float* scratch) {
-  const Window window = ssim_window();
-  const int stride = width + 32;
-  float* lines[5];
-  for (int map = 0; map < 5; ++map) {
-    lines[map] = scratch + map * stride;
-    for (int x = 0; x < kSsimRadius; ++x) lines[map][x] = lines[map][width + kSsimRadius + x] = 0.0f;
-  }
-  for (int x = 0; x < width; ++x) {
-    const float first = a[x * channels], second = b[x * channels];
-    lines[0][x + kSsimRadius] = first;
-    lines[1][x + kSsimRadius] = second;
-    lines[2][x + kSsimRadius] = first * first;
-    lines[3][x + kSsimRadius] = second * second;
-    lines[4][x + kSsimRadius] = first * second;
-  }
-  for (int map = 0; map < 5; ++map) blur_row(window, lines[map], width, out[map]);
+RF_INLINE Vec blur_along_row(const PicturePair& pair, const float* at) {
+  Vec sum = pair.window[0] * load(at - kSsimRadius * pair.channels);
+  for (int tap = 1; tap < kSsimTaps; ++tap) sum += pair.window[tap] * load(at + (tap - kSsimRadius) * pair.channels);
+  return sum;
 }
 
-double ssim_column(const float* const in[5], int row, int width, int height, const float* weight, float* const out[3],
-                   float* scratch) {
-  const Window window = ssim_window();
-  const int stride = width + 32;
-  float* map[5];
-  for (int at = 0; at < 5; ++at) {
-    map[at] = scratch + at * stride;
-    blur_column(window, in[at], row, width, height, map[at]);
+LossSums ssim_row(const PicturePair& pair, int row, float* const partial[3], float* scratch) {
+  const int length = pair.width * pair.channels;
+  const int first = row < kSsimRadius ? kSsimRadius - row : 0;
+  const int last = row + kSsimRadius < pair.height ? kSsimTaps : pair.height - row + kSsimRadius;
+  const Lines lines = zero_sided_lines(pair, 6, scratch);
+  write_shares(pair, row, lines[5]);
+  for (int x = 0; x < length; x += kLanes) {
+    const Strip strip_a(pair.a, row + first - kSsimRadius, last - first, length, x);
+    const Strip strip_b(pair.b, row + first - kSsimRadius, last - first, length, x);
+    Vec a = {}, b = {}, aa = {}, bb = {}, ab = {};
+    for (int tap = first; tap < last; ++tap) {
+      const Vec from_a = strip_a[tap - first], from_b = strip_b[tap - first];
+      const Vec part_a = pair.window[tap] * from_a, part_b = pair.window[tap] * from_b;
+      a += part_a;
+      b += part_b;
+      aa += part_a * from_a;
+      bb += part_b * from_b;
+      ab += part_a * from_b;
+    }
+    store(lines[0] + x, a);
+    store(lines[1] + x, b);
+    store(lines[2] + x, aa);
+    store(lines[3] + x, bb);
+    store(lines[4] + x, ab);
   }
-  double total = 0.0;
-  for (int x = 0; x < width; ++x) {
-    const float ma = map[0][x], mb = map[1][x];
-    const float a1 = 2.0f * ma * mb + kSsimC1, a2 = 2.0f * (map[4][x] - ma * mb) + kSsimC2;
-    const float b1 = ma * ma + mb * mb + kSsimC1;
-    const float b2 = (map[2][x] - ma * ma) + (map[3][x] - mb * mb) + kSsimC2;
-    const float inverse = 1.0f / (b1 * b2);
-    const float s = a1 * a2 * inverse;
-    const float share = weight != nullptr ? weight[x] : 1.0f;
-    map[0][x] = share * s;
-    out[0][x] = share * (2.0f * mb * (a2 - a1) * inverse - 2.0f * ma * s / b1 + 2.0f * ma * s / b2);
-    out[1][x] = -share * s / b2;
-    out[2][x] = share * 2.0f * a1 * inverse;
+  Vec ssim = {}, l1 = {};
+  for (int x = 0; x < length; x += kLanes) {
+    const Vec ma = blur_along_row(pair, lines[0] + x), mb = blur_along_row(pair, lines[1] + x);
+    const Vec aa = blur_along_row(pair, lines[2] + x), bb = blur_along_row(pair, lines[3] + x);
+    const Vec ab = blur_along_row(pair, lines[4] + x), share = load(lines[5] + x);
+    const Vec a1 = 2.0f * ma * mb + kSsimC1, a2 = 2.0f * (ab - ma * mb) + kSsimC2;
+    const Vec b1 = ma * ma + mb * mb + kSsimC1, b2 = (aa - ma * ma) + (bb - mb * mb) + kSsimC2;
+    const Vec inverse = 1.0f / (b1 * b2);
+    const Vec s = a1 * a2 * inverse, s_b1 = s * inverse * b2, s_b2 = s * inverse * b1;
+    ssim += share * s;
+    store(partial[0] + x, share * 2.0f * (mb * (a2 - a1) * inverse + ma * (s_b2 - s_b1)));
+    store(partial[1] + x, 0.0f - share * s_b2);
+    store(partial[2] + x, share * 2.0f * a1 * inverse);
+    const Vec difference = Strip(pair.a, row, 1, length, x)[0] - Strip(pair.b, row, 1, length, x)[0];
+    l1 += share * max_vec(difference, 0.0f - difference);
   }
-  for (int x = 0; x < width; ++x) total += map[0][x];
-  return total;
+  return {sum_of(ssim), sum_of(l1)};
 }
 
-void ssim_gradient_row(const float* const in[3], int row, int width, int height, const float* a, const float* b,
-                       int channels, const float* weight, float l1_scale, float ssim_scale, float* gradient,
-                       float* scratch) {
-  const Window window = ssim_window();
-  const int stride = width + 32;
-  float* map[3];
-  for (int at = 0; at < 3; ++at) {
-    float* line = scratch + 3 * stride;
-    for (int x = 0; x < kSsimRadius; ++x) line[x] = line[width + kSsimRadius + x] = 0.0f;
-    blur_column(window, in[at], row, width, height, line + kSsimRadius);
-    map[at] = scratch + at * stride;
-    blur_row(window, line, width, map[at]);
+void ssim_gradient_row(const PicturePair& pair, int row, const float* const partial[3], float l1_scale,
+                       float ssim_scale, float* gradient, float* scratch) {
+  const int length = pair.width * pair.channels, stride = loss_stride(pair.width, pair.channels);
+  const int first = row < kSsimRadius ? kSsimRadius - row : 0;
+  const int last = row + kSsimRadius < pair.height ? kSsimTaps : pair.height - row + kSsimRadius;
+  const Lines lines = zero_sided_lines(pair, 4, scratch);
+  write_shares(pair, row, lines[3]);
+  for (int x = 0; x < length; x += kLanes) {
+    for (int map = 0; map < 3; ++map) {
+      const float* from = partial[map] + static_cast<size_t>(row + first - kSsimRadius) * stride + x;
+      Vec sum = {};
+      for (int tap = first; tap < last; ++tap, from += stride) sum += pair.window[tap] * load(from);
+      store(lines[map] + x, sum);
+    }
   }
-  for (int x = 0; x < width; ++x) {
-    const float first = a[x * channels], second = b[x * channels];
-    const float share = weight != nullptr ? weight[x] : 1.0f;
-    const float sign = static_cast<float>(first > second) - static_cast<float>(first < second);
-    gradient[x * channels] =
-        l1_scale * share * sign + ssim_scale * (map[0][x] + 2.0f * first * map[1][x] + second * map[2][x]);
+  for (int x = 0; x < length; x += kLanes) {
+    const Vec a = Strip(pair.a, row, 1, length, x)[0], b = Strip(pair.b, row, 1, length, x)[0];
+    const Vec along = blur_along_row(pair, lines[0] + x) + 2.0f * a * blur_along_row(pair, lines[1] + x) +
+                      b * blur_along_row(pair, lines[2] + x);
+    const Vec one = splat_vec(l1_scale);
+    const Vec sign = select(a > b, one, select(a < b, 0.0f - one, Vec{}));
+    const Vec result = load(lines[3] + x) * sign + ssim_scale * along;
+    float* to = gradient + static_cast<size_t>(row) * length + x;
+    if (length - x >= kLanes) {
+      store(to, result);
+    } else {
+      for (int lane = 0; lane < length - x; ++lane) to[lane] = result[lane];
+    }
   }
 }
 

@@ -11,7 +11,7 @@
   const Kernels& function() {                                                                                  \
     static constexpr Kernels table = {name,  ::project, ::project_backward, ::blocks_reached,                  \
                                       ::blend, ::blend_backward, ::harmonics, ::harmonics_backward,            \
-                                      ::ssim_row, ::ssim_column, ::ssim_gradient_row};                         \
+                                      ::ssim_row, ::ssim_gradient_row};                                        \
     return table;                                                                                              \
   }                                                                                                            \
   }
