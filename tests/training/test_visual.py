@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from rf3dgs.core.errors import InputError
-from rf3dgs.core.frames import Pose
+from rf3dgs.core.frames import Pose, matrix_from_quaternion
 from rf3dgs.core.grids import Camera, pinhole_grid
 from rf3dgs.data.photo import Photo
 from rf3dgs.splats.density import Change
@@ -13,10 +13,11 @@ from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.image_loss import psnr
 from rf3dgs.training.adam import Adam
 from rf3dgs.training.config import VisualConfig
-from rf3dgs.training.initial import camera_box, random_start, views_of
-from rf3dgs.training.photographs import blending_weights, render_photo
+from rf3dgs.training.initial import camera_box, random_start, upright, views_of
+from rf3dgs.training.photographs import blending_weights, depth_error, render_photo
+from rf3dgs.training.planes import directions_of, find_planes
 from rf3dgs.training.schedule import Schedule
-from rf3dgs.training.sweep import swept_points
+from rf3dgs.training.sweep import Surfaces, swept_surfaces
 from rf3dgs.training.visual import VisualStage, fit_geometry
 
 SMALL = VisualConfig(
@@ -153,9 +154,39 @@ def test_swept_points_lie_on_the_wall_that_was_photographed():
         wall = camera.position + along * ((4.0 - camera.position[0]) / along[..., :1])
         shade = (0.5 + 0.08 * torch.sin(wall[..., 1:] @ waves.mT).sum(-1)).clamp(0, 1)
         pictures.append((shade[..., None].expand(-1, -1, 3) * 255).to(torch.uint8))
-    points, colour = swept_points(cameras, pictures, 10.0, 2000, torch.Generator().manual_seed(0))
-    assert len(points) == len(colour) > 1000
-    assert float((points[:, 0] - 4.0).abs().quantile(0.9)) < 0.1
+    found = Surfaces.of(*swept_surfaces(cameras, pictures, 10.0, torch.Generator().manual_seed(0)))
+    assert len(found.points) == len(found.colours) > 1000
+    assert float((found.points[:, 0] - 4.0).abs().quantile(0.9)) < 0.1
+    assert float(found.normals[:, 0].abs().median()) > 0.95
+    assert len(found.thinned(500, torch.Generator().manual_seed(0)).points) == 500
+
+
+def test_large_planes_are_found_among_scattered_points():
+    generator = torch.Generator().manual_seed(0)
+    floor, wall = torch.rand(2, 1500, 3, generator=generator) * 6
+    floor[:, 2] = 0.02 * torch.randn(1500, generator=generator)
+    wall[:, 0] = 5 + 0.02 * torch.randn(1500, generator=generator)
+    scattered = torch.rand(500, 3, generator=generator) * 6
+    planes = find_planes(torch.cat((floor, wall, scattered)), 0.05, 2, generator)
+    normals = planes.normals * planes.normals.sum(-1, keepdim=True).sign()
+    order = normals[:, 2].argsort(descending=True)
+    assert torch.allclose(normals[order], torch.tensor([[0.0, 0, 1], [1, 0, 0]]), atol=0.02)
+    assert torch.allclose(planes.offsets.abs()[order], torch.tensor([0.0, 5.0]), atol=0.05)
+    assert len(directions_of(planes, 1)) == 1 < len(directions_of(planes, 4))
+
+
+def test_flattened_gaussians_turn_their_shortest_axis_to_the_normal():
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    axes = matrix_from_quaternion(upright(directions))[:, :, 2]
+    assert torch.allclose((axes * directions).sum(-1).abs(), torch.ones(50), atol=1e-5)
+
+
+def test_the_drawn_depth_is_compared_where_the_sweep_knows_it():
+    known = torch.tensor([[2.0, 0.0], [4.0, 4.0]])
+    drawn = known.repeat_interleave(2, 0).repeat_interleave(2, 1)
+    assert float(depth_error(drawn, known)) == 0.0
+    drawn[0, 0], drawn[0, 3] = 3.0, 9.0
+    assert float(depth_error(drawn, known)) == pytest.approx(0.5 / 16)
 
 
 def test_points_are_a_place_to_begin(photos):

@@ -79,7 +79,7 @@ class VisualConfig:
 
     Iteration counts that are None follow from `steps`: the published values for long runs, shares of the run for short
     ones. Learning rates are for the published 30,000 steps; shorter runs multiply all but opacity's by
-    sqrt(30,000 / steps), at most 4.
+    sqrt(30,000 / steps), at most 4, and divide the means' by it when a sweep has put them on surfaces.
     """
 
     steps: int = 30_000
@@ -89,9 +89,9 @@ class VisualConfig:
     Gaussians, bit by bit, on one machine."""
 
     start: Literal["sweep", "random"] = "sweep"
-    """How to begin without points: "sweep" finds surface points by comparing the photographs at trial depths and adds
-    a few random Gaussians; "random" is a cloud in the box."""
-    start_count: int = 20_000
+    """How to begin without points: "sweep" finds surfaces by comparing the photographs on trial planes; "random" is a
+    cloud in the box."""
+    start_count: int = 30_000
     """How many Gaussians to begin with when there are no points to begin from."""
     bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     """Lowest and highest corner [m] of the box of the first Gaussians; None takes the cameras' box with a margin."""
@@ -142,6 +142,10 @@ class VisualConfig:
     """Adam's learning rate of the constant harmonic; the higher ones learn at a twentieth of it."""
     ssim_weight: float = 0.2
     """Share of D-SSIM in the loss; the rest is L1."""
+
+    depth_weight: float | None = None
+    """Weight of the relative error of the drawn depth against the sweep's; None: 0.5 for the shortest runs, falling to
+    the published method's 0 at 30,000 steps."""
 
     backend: Literal["auto", "native", "reference", "gsplat"] = "auto"
     """Which rasterizer works."""

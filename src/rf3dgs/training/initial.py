@@ -1,5 +1,7 @@
 """Where the visual stage begins: the box the scene may fill, and Gaussians in it, swept or random."""
 
+import dataclasses
+import math
 from collections.abc import Sequence
 
 import torch
@@ -8,12 +10,14 @@ from torch import Tensor
 from rf3dgs.core.grids import Camera
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.training.loop import random_at
-from rf3dgs.training.sweep import swept_points
+from rf3dgs.training.sweep import Surfaces, swept_surfaces
 
 BOX_MARGIN = 0.25
 SMALLEST_EXTENT = 0.1
-SWEPT_SHARE = 0.85
-SWEPT_OPACITY = 0.3
+SWEPT_OPACITY = 0.7
+SWEPT_SCALE = 0.8
+SWEPT_LARGEST = 0.02
+FLATNESS = 0.2
 LEAST_SWEPT = 100
 
 
@@ -61,18 +65,35 @@ def swept_start(
     *,
     degree: int,
     seed: int,
-) -> Gaussians:
-    """At most `count` Gaussians: 85 % on surfaces that a plane sweep finds in the box [m], the others random in it.
+) -> tuple[Gaussians, list[Tensor]]:
+    """At most `count` flattened Gaussians on surfaces that a plane sweep finds in the box [m], and the depth maps.
 
-    `pictures` are bytes `[row, col, 3]`. Where the sweep finds fewer than a hundred points, all are random.
+    `pictures` are bytes `[row, col, 3]`. Where the sweep finds fewer than a hundred points, all are random and there
+    are no depth maps. A depth map `[row, col]` [m, along the optical axis], smaller than its picture, is 0 where the
+    depth is not known.
     """
     box = torch.tensor([list(low), list(high)], dtype=torch.float32)
     corners = torch.stack([(camera.position - box).abs().amax(0) for camera in cameras])
     far = float(torch.linalg.vector_norm(corners, dim=-1).max())
-    points, colours = swept_points(cameras, pictures, far, int(SWEPT_SHARE * count), random_at(seed, 0, "sweep"))
-    inside = ((points > box[0]) & (points < box[1])).all(-1)
-    if int(inside.sum()) < LEAST_SWEPT:
-        return random_start(cameras, count, low, high, degree=degree, seed=seed)
-    swept = Gaussians.from_points(points[inside], colours[inside], degree=degree, opacity=SWEPT_OPACITY)
-    others = max(1, int((1 - SWEPT_SHARE) * count))
-    return Gaussians.join([swept, random_start(cameras, others, low, high, degree=degree, seed=seed)])
+    generator = random_at(seed, 0, "sweep")
+    views, known = swept_surfaces(cameras, pictures, far, generator)
+    known = [
+        mask & ((view.world > box[0]) & (view.world < box[1])).all(-1) for view, mask in zip(views, known, strict=True)
+    ]
+    found = Surfaces.of(views, known)
+    if len(found.points) < LEAST_SWEPT:
+        return random_start(cameras, count, low, high, degree=degree, seed=seed), []
+    depths = [torch.where(mask, view.depth, 0.0) for view, mask in zip(views, known, strict=True)]
+    found = found.thinned(count, generator)
+    swept = Gaussians.from_points(found.points, found.colours, degree=degree, opacity=SWEPT_OPACITY)
+    scales = swept.log_scales.clone()
+    scales += math.log(SWEPT_SCALE)
+    scales = scales.clamp_max(math.log(SWEPT_LARGEST * far))
+    scales[:, 2] += math.log(FLATNESS)
+    return dataclasses.replace(swept, log_scales=scales, quats=upright(found.normals)), depths
+
+
+def upright(normals: Tensor) -> Tensor:
+    """Rotations `[point, 4]` (wxyz) that turn the z axis to unit `normals` `[point, 3]`."""
+    x, y, z = torch.where(normals[:, 2:] < 0, -normals, normals).unbind(-1)
+    return torch.nn.functional.normalize(torch.stack((1 + z, -y, x, torch.zeros_like(z)), -1), dim=-1)

@@ -67,3 +67,11 @@ def shrunk(camera: Camera, picture: Tensor, factor: int) -> tuple[Camera, Tensor
     size = max(1, round(camera.height / factor)), max(1, round(camera.width / factor))
     smaller = torch.nn.functional.interpolate(target.permute(2, 0, 1)[None], size=size, mode="area")
     return camera.resized(size[1], size[0]), smaller[0].permute(1, 2, 0).contiguous()
+
+
+def depth_error(drawn: Tensor, known: Tensor) -> Tensor:
+    """Mean relative error of a drawn depth map `[row, col]` where a smaller one is known (above 0)."""
+    expected = torch.nn.functional.interpolate(known[None, None], size=drawn.shape, mode="nearest")[0, 0]
+    counts = expected > 0
+    relative = torch.where(counts, drawn / expected.clamp_min(1e-6) - 1, 0.0)
+    return relative.abs().clamp_max(1.0).sum() / drawn.numel()

@@ -7,6 +7,7 @@ from rf3dgs.training.config import VisualConfig
 
 PUBLISHED_STEPS = 30_000
 LARGEST_HASTE = 4.0
+SHORT_DEPTH_WEIGHT = 0.5
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class Schedule:
     lr_means: float
     lr_means_final: float
     haste: float
-    """Short runs learn faster: every learning rate but opacity's is multiplied by this."""
+    """Short runs learn faster: learning rates are multiplied by this, see `VisualConfig`."""
+    depth_weight: float
 
     @classmethod
     def of(cls, config: VisualConfig) -> "Schedule":
@@ -50,6 +52,9 @@ class Schedule:
             degree=config.degree,
             lr_means=config.lr_means,
             lr_means_final=config.lr_means_final,
+            depth_weight=SHORT_DEPTH_WEIGHT * max(0.0, 1 - steps / PUBLISHED_STEPS)
+            if config.depth_weight is None
+            else config.depth_weight,
             haste=min(LARGEST_HASTE, max(1.0, (PUBLISHED_STEPS / steps) ** 0.5)),
         )
 
@@ -64,7 +69,7 @@ class Schedule:
     def means_rate(self, iteration: int) -> float:
         """The means' learning rate as a share of the scene's extent: exponential between its two ends."""
         share = iteration / max(1, self.steps - 1)
-        return self.haste * self.lr_means * (self.lr_means_final / self.lr_means) ** share
+        return self.lr_means * (self.lr_means_final / self.lr_means) ** share
 
     def densifies_after(self, iteration: int) -> bool:
         """Whether the population changes after an iteration."""

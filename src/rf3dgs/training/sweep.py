@@ -1,12 +1,15 @@
-"""Surface points out of posed photographs by plane sweep: a better place to begin than random Gaussians.
+"""Surfaces out of posed photographs by plane sweep: a better place to begin than random Gaussians.
 
-For every pixel of a small copy of each photograph, depths are tried in even steps of inverse depth; the one at which
-the neighbouring photographs agree best (normalised cross-correlation of windows) is kept where it is clear and where
-the depth map of another photograph confirms it. Walls without texture yield no points. Collins (1996), "A space-sweep
-approach to true multi-image matching".
+A small copy of each photograph is compared with its neighbours on trial planes (normalised cross-correlation of
+windows), in three rounds: planes that face the camera, in even steps of inverse depth; planes along the normals of the
+large planes found so far, on which floors and ceilings seen at a flat angle match as well; and those large planes
+themselves, which fill what is left between clear pixels. A depth counts where the depth map of another photograph
+confirms it. Collins (1996), "A space-sweep approach to true multi-image matching"; Gallup et al. (2007), "Real-time
+plane-sweeping stereo with multiple sweeping directions".
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -14,126 +17,199 @@ from torch.nn.functional import avg_pool2d, grid_sample
 
 from rf3dgs.core.grids import Camera
 from rf3dgs.training.photographs import shrunk
+from rf3dgs.training.planes import Planes, directions_of, find_planes
 
-PIXELS_ACROSS = 112
-DEPTHS = 96
+PIXELS_ACROSS = 80
+DEPTHS = 80
 FINER = 4
 NEAREST = 0.04
-NEIGHBOURS = 3
+NEIGHBOURS = 4
 WINDOW = 7
-CORRELATION = 0.75
-LEAST_CONTRAST = 0.015
-AGREEMENT = 0.06
+CORRELATION = 0.7
+LEAST_CONTRAST = 0.012
+AGREEMENT = 0.05
+DIRECTIONS = 4
+PLANES = 16
+TOLERANCE = 0.005
+FILL_CORRELATION = 0.35
 
 
-def swept_points(
-    cameras: Sequence[Camera], pictures: Sequence[Tensor], far: float, count: int, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    """At most `count` points `[point, 3]` [m] on surfaces, evenly over their area, and their colours, 0 to 1.
+class View:
+    """A small photograph as the sweep needs it."""
+
+    def __init__(self, camera: Camera, picture: Tensor) -> None:
+        self.camera, self.picture, self.grey = camera, picture, picture.mean(-1)
+        row, col = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+        pixel = torch.stack((col, row, torch.ones_like(row)))
+        self.rays = torch.einsum("ij,jrc->irc", torch.linalg.inv(camera.K), pixel)
+        self.mean = window(self.grey[None])
+        self.spread = (window(self.grey[None].square()) - self.mean.square()).clamp_min(0.0)
+        self.textured = self.spread[0] > LEAST_CONTRAST**2
+        self.depth = torch.zeros_like(self.grey)
+        self.normal = torch.zeros(*self.grey.shape, 3)
+        self.score = torch.full_like(self.grey, -1.0)
+
+    def unproject(self, depth: Tensor) -> Tensor:
+        """World points `[row, col, 3]` of a depth map `[row, col]` [m] along the optical axis."""
+        return (self.rays * depth).permute(1, 2, 0) @ self.camera.viewmat[:3, :3] + self.camera.position
+
+    @property
+    def world(self) -> Tensor:
+        """The surface points `[row, col, 3]` [m] of the pixels."""
+        return self.unproject(self.depth)
+
+    def slopes(self, normals: Tensor) -> Tensor:
+        """Each ray's component along world `normals` `[direction, 3]`: `[direction, row, col]`."""
+        return torch.einsum("di,irc->drc", normals @ self.camera.viewmat[:3, :3].mT, self.rays)
+
+
+def agreement(view: View, partners: Sequence[View], inverse: Tensor) -> Tensor:
+    """Correlation with the two best of the partners, -1 to 1, at inverse depths `[layer, row, col]` [1/m]."""
+    scores = []
+    camera = view.camera
+    for other in partners:
+        turn = other.camera.viewmat[:3, :3] @ camera.viewmat[:3, :3].mT
+        shift = other.camera.K @ (other.camera.viewmat[:3, 3] - turn @ camera.viewmat[:3, 3])
+        base = torch.einsum("ij,jrc->irc", other.camera.K @ turn, view.rays)
+        z = torch.add(base[2], inverse, alpha=float(shift[2]))
+        ahead = z > 1e-3
+        scale = 2 / torch.where(ahead, z, 1.0)
+        x = torch.add(base[0], inverse, alpha=float(shift[0])).mul_(scale / other.camera.width).sub_(1)
+        y = torch.add(base[1], inverse, alpha=float(shift[1])).mul_(scale / other.camera.height).sub_(1)
+        inside = ahead & (x.abs() < 1) & (y.abs() < 1)
+        where = torch.stack((x, y), -1).reshape(1, -1, camera.width, 2)
+        seen = grid_sample(other.grey[None, None], where, align_corners=False)[0, 0].reshape(inverse.shape)
+        mean = window(seen)
+        covariance = window(seen * view.grey) - mean * view.mean
+        spread = (window(seen.square()) - mean.square()).clamp_min(0.0)
+        score = covariance * torch.rsqrt(view.spread * spread + 1e-8)
+        scores.append(torch.where(inside, score, -1.0))
+    return torch.stack(scores).topk(min(2, len(scores)), 0).values.mean(0)
+
+
+def sweep(view: View, partners: Sequence[View], inverse: Tensor, slope: Tensor, normal: Tensor | None) -> None:
+    """Try planes of one direction at inverse distances `inverse` `[layer]`; the view keeps what beats its best.
+
+    `slope` `[row, col]` is each ray's component along the direction.
+    """
+    score = agreement(view, partners, inverse[:, None, None] * slope)
+    layer = score.argmax(0)
+    fine = inverse[layer] + (inverse[1] - inverse[0]) / FINER * torch.arange(1 - FINER, FINER)[:, None, None]
+    fine_best, fine_layer = agreement(view, partners, fine * slope).max(0)
+    depth = 1 / (fine.gather(0, fine_layer[None])[0] * slope).clamp_min(1e-6)
+    better = (fine_best > view.score) & (layer > 0) & (layer < len(inverse) - 1)
+    facing = view.camera.viewmat[2, :3] if normal is None else normal
+    view.score = torch.where(better, fine_best, view.score)
+    view.depth = torch.where(better, depth, view.depth)
+    view.normal = torch.where(better[..., None], facing, view.normal)
+
+
+def confirmed(view: View, partners: Sequence[View]) -> Tensor:
+    """Where `[row, col]` the view's depth is clear and another view has the same."""
+    points = view.unproject(view.depth).reshape(-1, 3)
+    agrees = torch.zeros(len(points), dtype=torch.bool)
+    for other in partners:
+        pixel, inside = project(other.camera, points)
+        col, row = pixel.long().clamp_min(0).unbind(-1)
+        row, col = row.clamp_max(other.camera.height - 1), col.clamp_max(other.camera.width - 1)
+        z = points @ other.camera.viewmat[2, :3] + other.camera.viewmat[2, 3]
+        agrees |= inside & ((other.depth[row, col] - z).abs() < AGREEMENT * z) & (other.score[row, col] > CORRELATION)
+    return agrees.reshape(view.depth.shape) & (view.score > CORRELATION) & view.textured
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Points `[point, 3]` [m] on surfaces, their unit normals and colours (0 to 1)."""
+
+    points: Tensor
+    normals: Tensor
+    colours: Tensor
+    areas: Tensor
+
+    @classmethod
+    def of(cls, views: Sequence[View], known: Sequence[Tensor]) -> "Surfaces":
+        """What the pixels `known` `[row, col]` of each view show, with the area [m^2, up to a factor] of each."""
+        points = [view.unproject(view.depth)[mask] for view, mask in zip(views, known, strict=True)]
+        normals = [view.normal[mask] for view, mask in zip(views, known, strict=True)]
+        colours = [view.picture[mask] for view, mask in zip(views, known, strict=True)]
+        areas = [view.depth[mask].square() for view, mask in zip(views, known, strict=True)]
+        return cls(torch.cat(points), torch.cat(normals), torch.cat(colours), torch.cat(areas))
+
+    def thinned(self, count: int, generator: torch.Generator) -> "Surfaces":
+        """At most `count` of the points, evenly over the area."""
+        kept = (self.areas / torch.rand(len(self.areas), generator=generator).log().neg()).argsort(descending=True)
+        kept = kept[:count]
+        return Surfaces(self.points[kept], self.normals[kept], self.colours[kept], self.areas[kept])
+
+
+def swept_surfaces(
+    cameras: Sequence[Camera], pictures: Sequence[Tensor], far: float, generator: torch.Generator
+) -> tuple[list[View], list[Tensor]]:
+    """Depths and normals of all photographs, and where they count.
 
     `pictures` are bytes `[row, col, 3]`; depths are tried from 4 % of `far` [m] to `far`.
     """
-    small = [shrunk(c, p, max(1, round(c.width / PIXELS_ACROSS))) for c, p in zip(cameras, pictures, strict=True)]
-    views = [camera for camera, _ in small]
-    greys = [picture.mean(-1) for _, picture in small]
+    views = [
+        View(*shrunk(c, p, max(1, round(c.width / PIXELS_ACROSS)))) for c, p in zip(cameras, pictures, strict=True)
+    ]
     inverse = torch.linspace(1 / far, 1 / (NEAREST * far), DEPTHS)
-    partners = [_partners(views, index, far) for index in range(len(views))]
-    depths = [_depth_map(views, greys, index, partners[index], inverse) for index in range(len(views))]
-    points, colours, areas = [torch.zeros(0, 3)], [torch.zeros(0, 3)], [torch.zeros(0)]
-    for index, (camera, picture) in enumerate(small):
-        known = depths[index] > 0
-        found = _unproject(camera, depths[index])[known]
-        confirmed = torch.zeros(len(found), dtype=torch.bool)
-        for other in partners[index]:
-            confirmed |= _agrees(views[other], depths[other], found)
-        points.append(found[confirmed])
-        colours.append(picture[known][confirmed])
-        areas.append(depths[index][known][confirmed].square())
-    if sum(map(len, points)) == 0:
-        return points[0], colours[0]
-    every, colour, area = torch.cat(points), torch.cat(colours), torch.cat(areas)
-    kept = (area / torch.rand(len(area), generator=generator).log().neg()).argsort(descending=True)[:count]
-    return every[kept], colour[kept]
+    partners = [[views[other] for other in _partners(views, index, far)] for index in range(len(views))]
+    pairs = [(view, others) for view, others in zip(views, partners, strict=True) if others]
+    for view, others in pairs:
+        sweep(view, others, inverse, torch.ones_like(view.grey), None)
+    found = Surfaces.of(views, [confirmed(view, others) for view, others in zip(views, partners, strict=True)])
+    planes = find_planes(found.thinned(6000, generator).points, TOLERANCE * far, PLANES, generator)
+    for direction in directions_of(planes, DIRECTIONS):
+        for view, others in pairs:
+            slope = view.slopes(direction[None])[0]
+            sweep(view, others, inverse, slope.abs().clamp_min(1e-3), direction)
+    sure = [confirmed(view, others) for view, others in zip(views, partners, strict=True)]
+    found = Surfaces.of(views, sure)
+    planes = find_planes(found.thinned(6000, generator).points, 0.5 * TOLERANCE * far, PLANES, generator)
+    known = []
+    for view, others, mask in zip(views, partners, sure, strict=True):
+        known.append(mask | _fill(view, others, planes, mask, far) if others and len(planes) else mask)
+    return views, known
 
 
-def _partners(views: Sequence[Camera], index: int, far: float) -> list[int]:
+def _fill(view: View, partners: Sequence[View], planes: Planes, sure: Tensor, far: float) -> Tensor:
+    """Give pixels that are not sure the plane on which the photographs agree best; returns where they do."""
+    heights = planes.offsets - planes.normals @ view.camera.position
+    inverse = view.slopes(planes.normals) / heights[:, None, None]
+    possible = (inverse > 1 / far) & (inverse < 1 / (0.5 * NEAREST * far))
+    score = torch.where(possible, agreement(view, partners, inverse.clamp_min(1 / far)), -1.0)
+    best, plane = window(score).max(0)
+    filled = ~sure & (best > FILL_CORRELATION)
+    depth = 1 / inverse.gather(0, plane[None])[0].clamp_min(1e-6)
+    view.depth = torch.where(filled, depth, view.depth)
+    view.normal = torch.where(filled[..., None], planes.normals[plane], view.normal)
+    return filled
+
+
+def _partners(views: Sequence[View], index: int, far: float) -> list[int]:
     """The views that share most with view `index`, counted over a coarse grid of depths, not from the same place."""
-    depth = torch.tensor([0.1, 0.2, 0.35, 0.6])[:, None, None] * far
-    probe = views[index].resized(12, 9)
-    points = torch.cat([_unproject(probe, d.expand(9, 12)).reshape(-1, 3) for d in depth])
+    own = views[index].camera
+    probe = View(own.resized(12, 9), torch.zeros(9, 12, 3))
+    depths = [torch.full((9, 12), share * far) for share in (0.1, 0.2, 0.35, 0.6)]
+    points = torch.cat([probe.unproject(depth).reshape(-1, 3) for depth in depths])
     scores = []
-    for other, camera in enumerate(views):
-        moved = float(torch.linalg.vector_norm(camera.position - views[index].position))
-        facing = float(camera.viewmat[2, :3] @ views[index].viewmat[2, :3])
-        inside = _project(camera, points)[1].float().mean()
+    for other, view in enumerate(views):
+        moved = float(torch.linalg.vector_norm(view.camera.position - own.position))
+        facing = float(view.camera.viewmat[2, :3] @ own.viewmat[2, :3])
+        inside = project(view.camera, points)[1].float().mean()
         scores.append(float(inside) if other != index and moved > 0.01 * far and facing > 0.3 else 0.0)
     order = sorted(range(len(views)), key=lambda other: -scores[other])[:NEIGHBOURS]
     return [other for other in order if scores[other] > 0.05]
 
 
-def _depth_map(
-    views: Sequence[Camera], greys: Sequence[Tensor], index: int, partners: Sequence[int], inverse: Tensor
-) -> Tensor:
-    """Depths [m] along the optical axis `[row, col]` of one view; 0 where unclear.
-
-    The best of all trial depths is refined by a second sweep of finer steps around it.
-    """
-    grey = greys[index]
-    if len(partners) == 0:
-        return torch.zeros_like(grey)
-    score = _agreement(views, greys, index, partners, inverse[:, None, None].expand(-1, *grey.shape))
-    best, layer = score.max(0)
-    apart = (torch.arange(len(inverse))[:, None, None] - layer).abs() > 3
-    rival = torch.where(apart, score, -1.0).amax(0)
-    contrast = _window(grey[None].square()) - _window(grey[None]).square()
-    step = (inverse[1] - inverse[0]) / FINER
-    fine = inverse[layer] + step * torch.arange(-FINER, FINER + 1)[:, None, None]
-    fine_best, fine_layer = _agreement(views, greys, index, partners, fine).max(0)
-    best = torch.maximum(best, fine_best)
-    clear = (best > CORRELATION) & (best - rival > 0.05) & (contrast[0] > LEAST_CONTRAST**2)
-    clear &= (layer > 0) & (layer < len(inverse) - 1)
-    return torch.where(clear, 1 / fine.gather(0, fine_layer[None])[0].clamp_min(1e-6), 0.0)
-
-
-def _agreement(
-    views: Sequence[Camera], greys: Sequence[Tensor], index: int, partners: Sequence[int], inverse: Tensor
-) -> Tensor:
-    """Correlation with the two best of the partners, -1 to 1, at inverse depths `[layer, row, col]` [1/m]."""
-    camera, grey = views[index], greys[index]
-    layers = _unproject(camera, 1 / inverse.clamp_min(1e-6))
-    mean = _window(grey[None])
-    spread = (_window(grey[None].square()) - mean.square()).clamp_min(0.0)
-    scores = []
-    for other in partners:
-        pixel, inside = _project(views[other], layers.reshape(-1, 3))
-        size = torch.tensor([views[other].width, views[other].height])
-        where = (2 * pixel / size - 1).reshape(1, -1, camera.width, 2)
-        seen = grid_sample(greys[other][None, None], where, align_corners=False)[0, 0].reshape(layers.shape[:3])
-        there = inside.float().reshape(layers.shape[:3])
-        other_mean = _window(seen)
-        covariance = _window(seen * grey) - other_mean * mean
-        other_spread = (_window(seen.square()) - other_mean.square()).clamp_min(0.0)
-        score = covariance * torch.rsqrt(spread * other_spread + 1e-8)
-        scores.append(torch.where(_window(there) > 0.95, score, -1.0))
-    return torch.stack(scores).sort(0, descending=True).values[:2].mean(0)
-
-
-def _window(maps: Tensor) -> Tensor:
+def window(maps: Tensor) -> Tensor:
     """Means over square windows of `[map, row, col]`."""
     half = WINDOW // 2
     rows = avg_pool2d(maps[:, None], (WINDOW, 1), 1, (half, 0), count_include_pad=False)
     return avg_pool2d(rows, (1, WINDOW), 1, (0, half), count_include_pad=False)[:, 0]
 
 
-def _unproject(camera: Camera, depth: Tensor) -> Tensor:
-    """World points `[row, col, 3]` of a depth map `[row, col]` [m] along the optical axis."""
-    row, col = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    x = (col - camera.K[0, 2]) / camera.K[0, 0]
-    y = (row - camera.K[1, 2]) / camera.K[1, 1]
-    return torch.stack((x, y, torch.ones_like(x)), -1) * depth[..., None] @ camera.viewmat[:3, :3] + camera.position
-
-
-def _project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
+def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     """Pixel coordinates `[point, 2]` of world points, and who is inside the picture."""
     x, y, z = (points @ camera.viewmat[:3, :3].mT + camera.viewmat[:3, 3]).unbind(-1)
     ahead = z > 1e-3
@@ -141,12 +217,3 @@ def _project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     pixel = torch.stack((camera.K[0, 0] * x / z + camera.K[0, 2], camera.K[1, 1] * y / z + camera.K[1, 2]), -1)
     inside = ahead & (pixel >= 0).all(-1) & (pixel < torch.tensor([camera.width, camera.height])).all(-1)
     return torch.where(inside[:, None], pixel, -1e3), inside
-
-
-def _agrees(camera: Camera, depth: Tensor, points: Tensor) -> Tensor:
-    """Whether the depth map `[row, col]` of `camera` has each point `[point, 3]` at its depth."""
-    pixel, inside = _project(camera, points)
-    col, row = pixel.long().clamp_min(0).unbind(-1)
-    there = depth[row.clamp_max(camera.height - 1), col.clamp_max(camera.width - 1)]
-    z = points @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
-    return inside & (there > 0) & ((there - z).abs() < AGREEMENT * z)

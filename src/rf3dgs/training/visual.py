@@ -25,7 +25,7 @@ from rf3dgs.training.checkpoint import State, fingerprint
 from rf3dgs.training.config import VisualConfig
 from rf3dgs.training.initial import camera_box, random_start, swept_start
 from rf3dgs.training.loop import random_at, train, view_at
-from rf3dgs.training.photographs import blending_weights, colour_towards, picture_of, shrunk
+from rf3dgs.training.photographs import blending_weights, colour_towards, depth_error, picture_of, shrunk
 from rf3dgs.training.schedule import Schedule
 
 TRAINED = ("means", "quats", "log_scales", "logit_opacities", "level", "bands")
@@ -85,6 +85,7 @@ class VisualStage:
             "first Gaussians": fingerprint(first),
         }
         self.degree = min(initial.degree, config.degree) if isinstance(initial, Gaussians) else 0
+        self.depths: list[Tensor] = []
         self.parameters: dict[str, Tensor] = {}
         self.adam = Adam({})
         self.density = DensityState(0)
@@ -107,7 +108,8 @@ class VisualStage:
         count, seed = self.config.start_count, self.config.seed
         if self.config.start == "random":
             return random_start(self.cameras, count, low, high, degree=degree, seed=seed)
-        return swept_start(self.cameras, self.pictures, count, low, high, degree=degree, seed=seed)
+        gaussians, self.depths = swept_start(self.cameras, self.pictures, count, low, high, degree=degree, seed=seed)
+        return gaussians
 
     def gaussians(self) -> Gaussians:
         """The present Gaussians, with all harmonics that the configuration asks for."""
@@ -129,22 +131,26 @@ class VisualStage:
             now = self.parameters
         view = view_at(config.seed, iteration, len(self.cameras))
         camera, target = shrunk(self.cameras[view], self.pictures[view], schedule.shrink_at(iteration))
-        background = torch.zeros(3)
+        background = torch.zeros(4)
         if config.background == "random":
-            background = torch.rand(3, generator=random_at(config.seed, iteration, "background"))
+            background[:3] = torch.rand(3, generator=random_at(config.seed, iteration, "background"))
+        depth = now["means"] @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+        colour = colour_towards(now["level"], now["bands"], now["means"], camera)
         offset = torch.zeros(len(now["means"]), 2, requires_grad=True)
         raster = rasterize(
             now["means"],
             now["quats"],
             torch.exp(now["log_scales"]),
             torch.sigmoid(now["logit_opacities"]),
-            colour_towards(now["level"], now["bands"], now["means"], camera),
+            torch.cat((colour, depth[:, None]), 1),
             camera,
             background=background,
             screen_offset=offset,
             backend=config.backend,
         )
-        loss = l1_ssim(raster.values, target, ssim_weight=config.ssim_weight)
+        loss = l1_ssim(raster.values[..., :3].contiguous(), target, ssim_weight=config.ssim_weight)
+        if self.depths and schedule.depth_weight > 0:
+            loss = loss + schedule.depth_weight * depth_error(raster.values[..., 3], self.depths[view])
         loss.backward()
         if offset.grad is not None:
             self.density.observe(offset.grad, raster.radii, camera.width, camera.height)
@@ -154,8 +160,9 @@ class VisualStage:
 
     def _rates(self, iteration: int) -> dict[str, float]:
         config, haste = self.config, self.schedule.haste
+        pace = 1 / haste if self.depths else haste
         return {
-            "means": self.schedule.means_rate(iteration) * self.extent,
+            "means": pace * self.schedule.means_rate(iteration) * self.extent,
             "quats": haste * config.lr_quats,
             "log_scales": haste * config.lr_scales,
             "logit_opacities": config.lr_opacities,
@@ -214,6 +221,7 @@ class VisualStage:
             ("density", self.density.tensors()),
         ):
             tensors |= {f"{group}.{name}": tensor for name, tensor in values.items()}
+        tensors |= {f"depth.{view}": depth for view, depth in enumerate(self.depths)}
         return State(tensors, {"adam_steps": self.adam.count, "degree": self.degree})
 
     def restore(self, state: State) -> None:
@@ -230,6 +238,7 @@ class VisualStage:
         self.adam.count = int(str(state.numbers["adam_steps"]))
         self.degree = int(str(state.numbers["degree"]))
         self.density = DensityState.from_tensors(group("density."))
+        self.depths = [depth for _, depth in sorted(group("depth.").items(), key=lambda item: int(item[0]))]
 
 
 def _leaves(gaussians: Gaussians, degree: int) -> dict[str, Tensor]:
