@@ -25,6 +25,7 @@ typedef int32_t IntVec __attribute__((vector_size(64)));
 RF_INLINE Vec select(IntVec mask, Vec yes, Vec no) { return mask ? yes : no; }
 RF_INLINE IntVec int_bits(Vec value) { return (IntVec)value; }
 RF_INLINE Vec float_bits(IntVec value) { return (Vec)value; }
+RF_INLINE Vec to_float(IntVec value) { return __builtin_convertvector(value, Vec); }
 
 #else
 
@@ -86,12 +87,18 @@ RF_INLINE Vec& operator*=(Vec& a, const Vec& b) { return a = a * b; }
   }
 RF_BINARY(&)
 RF_BINARY(+)
+RF_BINARY(-)
 #undef RF_BINARY
 
 RF_INLINE IntVec& operator&=(IntVec& a, const IntVec& b) { return a = a & b; }
 RF_INLINE IntVec operator&(const IntVec& a, int32_t b) {
   IntVec result;
   RF_EACH_PART result.part[at] = a.part[at] & b;
+  return result;
+}
+RF_INLINE IntVec operator+(const IntVec& a, int32_t b) {
+  IntVec result;
+  RF_EACH_PART result.part[at] = a.part[at] + b;
   return result;
 }
 RF_INLINE IntVec operator!=(const IntVec& a, int32_t b) {
@@ -113,6 +120,11 @@ RF_INLINE Vec select(const IntVec& mask, const Vec& yes, const Vec& no) {
 RF_INLINE IntVec int_bits(const Vec& value) {
   IntVec result;
   RF_EACH_PART result.part[at] = (IntPart)value.part[at];
+  return result;
+}
+RF_INLINE Vec to_float(const IntVec& value) {
+  Vec result;
+  RF_EACH_PART result.part[at] = __builtin_convertvector(value.part[at], FloatPart);
   return result;
 }
 RF_INLINE Vec float_bits(const IntVec& value) {
@@ -148,8 +160,23 @@ RF_INLINE void store(float* to, const Vec& value) {
 
 #endif
 
+// The second where one of them is NaN.
+#if defined(__AVX512F__)
+RF_INLINE Vec min_vec(Vec a, Vec b) { return (Vec)_mm512_min_ps((__m512)a, (__m512)b); }
+RF_INLINE Vec max_vec(Vec a, Vec b) { return (Vec)_mm512_max_ps((__m512)a, (__m512)b); }
+#elif defined(__AVX2__)
+RF_INLINE Vec min_vec(Vec a, Vec b) {
+  RF_EACH_PART a.part[at] = (FloatPart)_mm256_min_ps((__m256)a.part[at], (__m256)b.part[at]);
+  return a;
+}
+RF_INLINE Vec max_vec(Vec a, Vec b) {
+  RF_EACH_PART a.part[at] = (FloatPart)_mm256_max_ps((__m256)a.part[at], (__m256)b.part[at]);
+  return a;
+}
+#else
 RF_INLINE Vec min_vec(Vec a, Vec b) { return select(a < b, a, b); }
 RF_INLINE Vec max_vec(Vec a, Vec b) { return select(a > b, a, b); }
+#endif
 RF_INLINE Vec clamp_vec(Vec value, Vec low, Vec high) { return min_vec(max_vec(value, low), high); }
 
 RF_INLINE Vec sqrt_vec(Vec value) {
@@ -193,6 +220,33 @@ RF_INLINE float sum_of(Vec value) {
   std::memcpy(&b, reinterpret_cast<const char*>(&eight) + 16, 16);
   const Vec4 four = a + b;
   return (four[0] + four[2]) + (four[1] + four[3]);
+}
+
+// The sums of all lanes of N vectors, four at a time.
+template <int N>
+RF_INLINE void sums_of(const Vec* value, float* out) {
+  int done = 0;
+#if defined(__AVX512F__)
+  const __m512i firsts = _mm512_set_epi32(12, 8, 4, 0, 12, 8, 4, 0, 12, 8, 4, 0, 12, 8, 4, 0);
+  for (; done + 4 <= N; done += 4) {
+    const __m512 a = (__m512)value[done], b = (__m512)value[done + 1];
+    const __m512 c = (__m512)value[done + 2], d = (__m512)value[done + 3];
+    const __m512 ab = _mm512_shuffle_f32x4(a, b, 0x44) + _mm512_shuffle_f32x4(a, b, 0xee);
+    const __m512 cd = _mm512_shuffle_f32x4(c, d, 0x44) + _mm512_shuffle_f32x4(c, d, 0xee);
+    const __m512 quads = _mm512_shuffle_f32x4(ab, cd, 0x88) + _mm512_shuffle_f32x4(ab, cd, 0xdd);
+    const __m512 pairs = quads + _mm512_permute_ps(quads, 0x4e);
+    const __m512 sums = pairs + _mm512_permute_ps(pairs, 0xb1);
+    _mm_storeu_ps(out + done, _mm512_castps512_ps128(_mm512_permutexvar_ps(firsts, sums)));
+  }
+#elif defined(__AVX2__)
+  for (; done + 4 <= N; done += 4) {
+    __m256 eight[4];
+    for (int at = 0; at < 4; ++at) eight[at] = (__m256)(value[done + at].part[0] + value[done + at].part[1]);
+    const __m256 sums = _mm256_hadd_ps(_mm256_hadd_ps(eight[0], eight[1]), _mm256_hadd_ps(eight[2], eight[3]));
+    _mm_storeu_ps(out + done, _mm256_castps256_ps128(sums) + _mm256_extractf128_ps(sums, 1));
+  }
+#endif
+  for (; done < N; ++done) out[done] = sum_of(value[done]);
 }
 
 // e^x for x <= 0 with a relative error near 2e-7; zero below -87.

@@ -31,6 +31,16 @@ struct Extent {
   float x, y, depth;
 };
 
+// The first and last tiles of a box.
+struct TileBox {
+  int first_x, first_y, last_x, last_y;
+};
+
+// A tile that a splat reaches, with the bits of its 4x4 pixel blocks.
+struct Found {
+  uint32_t tile, splat, blocks;
+};
+
 // A splat in a tile's list with the bits of those 4x4 pixel blocks it reaches.
 struct Entry {
   uint32_t splat;
@@ -57,6 +67,9 @@ struct GeometryGradients {
   float* quats;
   float* scales;
 };
+
+// Floats of an entry's row of gradients.
+constexpr int gradient_row(int chunk, bool geometry) { return chunk + (geometry ? 6 : 1); }
 
 // One tile's share of a picture. `values` is [splat, channels] in the order of the splats.
 struct Tile {
@@ -98,13 +111,13 @@ struct Kernels {
   // From gradients on the screen of splats [begin, end) to gradients of the parameters.
   void (*project_backward)(const View&, const Parameters&, const Splat*, const SplatGradient*, size_t begin, size_t end,
                            const GeometryGradients&);
-  // Which of a tile's 4x4 blocks a splat reaches.
-  uint32_t (*blocks_reached)(const Splat&, float tile_x, float tile_y);
+  // Writes the tiles of a box that a splat reaches, row by row, and returns their number; `out` has room for all.
+  size_t (*tiles_reached)(const Splat&, uint32_t index, const TileBox&, int tiles_x, Found* out);
   void (*blend)(const Tile&, float* picture, float* weight);
-  // Adds to `value_gradients` [entry, chunk] and `splat_gradients` [entry]; geometry only when asked.
+  // Writes a row of gradients for every entry: of the values of the chunk, of opacity and, when geometry is asked for,
+  // of x, y, a, b, c.
   void (*blend_backward)(const Tile&, const float* picture, const float* weight, const float* picture_gradient,
-                         const float* weight_gradient, bool geometry, float* value_gradients,
-                         SplatGradient* splat_gradients);
+                         const float* weight_gradient, bool geometry, float* rows);
   void (*harmonics)(const float* sh, const float* directions, int bases, int channels, size_t begin, size_t end,
                     float* out);
   void (*harmonics_backward)(const float* gradient, const float* directions, int bases, int channels, size_t begin,

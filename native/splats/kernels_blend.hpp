@@ -21,15 +21,25 @@ constexpr float kRows[kLanes] = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3}
 
 // The least d^T conic d over each block's pixel centres' rectangle decides: a convex form's least value over a rectangle
 // lies on an edge that faces the centre, or is zero inside.
-uint32_t blocks_reached(const Splat& splat, float tile_x, float tile_y) {
-  const Vec left = 4.0f * load(kColumns) + (tile_x + 0.5f - splat.x), right = left + 3.0f;
-  const Vec top = 4.0f * load(kRows) + (tile_y + 0.5f - splat.y), bottom = top + 3.0f;
-  const Vec near_x = clamp_vec(Vec{}, left, right), near_y = clamp_vec(Vec{}, top, bottom);
-  const Vec edge_y = clamp_vec(near_x * (-splat.b / splat.c), top, bottom);
-  const Vec edge_x = clamp_vec(near_y * (-splat.b / splat.a), left, right);
-  const Vec first = splat.a * near_x * near_x + 2.0f * splat.b * near_x * edge_y + splat.c * edge_y * edge_y;
-  const Vec second = splat.a * edge_x * edge_x + 2.0f * splat.b * edge_x * near_y + splat.c * near_y * near_y;
-  return bits_of(min_vec(first, second) <= splat.cut * 1.0001f + 1e-3f);
+size_t tiles_reached(const Splat& splat, uint32_t index, const TileBox& box, int tiles_x, Found* out) {
+  const float slope_y = -splat.b / splat.c, slope_x = -splat.b / splat.a, cut = splat.cut * 1.0001f + 1e-3f;
+  const Vec lefts = 4.0f * load(kColumns) + (0.5f - splat.x), tops = 4.0f * load(kRows) + (0.5f - splat.y);
+  size_t reached = 0;
+  for (int tile_y = box.first_y; tile_y <= box.last_y; ++tile_y) {
+    const Vec top = tops + static_cast<float>(tile_y * kTileSize), bottom = top + 3.0f;
+    const Vec near_y = clamp_vec(Vec{}, top, bottom);
+    for (int tile_x = box.first_x; tile_x <= box.last_x; ++tile_x) {
+      const Vec left = lefts + static_cast<float>(tile_x * kTileSize), right = left + 3.0f;
+      const Vec near_x = clamp_vec(Vec{}, left, right);
+      const Vec edge_y = clamp_vec(near_x * slope_y, top, bottom), edge_x = clamp_vec(near_y * slope_x, left, right);
+      const Vec first = splat.a * near_x * near_x + 2.0f * splat.b * near_x * edge_y + splat.c * edge_y * edge_y;
+      const Vec second = splat.a * edge_x * edge_x + 2.0f * splat.b * edge_x * near_y + splat.c * near_y * near_y;
+      const uint32_t blocks = bits_of(min_vec(first, second) <= cut);
+      out[reached] = {static_cast<uint32_t>(tile_y * tiles_x + tile_x), index, blocks};
+      reached += blocks != 0;
+    }
+  }
+  return reached;
 }
 
 // What one splat does to one block: its alpha (zero where it does not count), the weight alpha T, and the new T.
@@ -101,7 +111,8 @@ void blend_channels(const Tile& tile, float* picture, float* weight) {
 
 template <int C, bool kGeometry>
 void blend_channels_backward(const Tile& tile, const float* picture, const float* weight, const float* picture_gradient,
-                             const float* weight_gradient, float* value_gradients, SplatGradient* splat_gradients) {
+                             const float* weight_gradient, float* rows) {
+  constexpr int kRow = gradient_row(C, kGeometry);
   Vec x[kBlocks], y[kBlocks], transmittance[kBlocks], behind[kBlocks], h[kBlocks], g[kBlocks][C];
   uint32_t alive = 0;
   for (int block = 0; block < kBlocks; ++block) {
@@ -128,46 +139,48 @@ void blend_channels_backward(const Tile& tile, const float* picture, const float
     h[block] = load(of_weight);
     for (int channel = 0; channel < C; ++channel) g[block][channel] = load(of_channel[channel]);
   }
-  for (size_t at = 0; at < tile.count && alive != 0; ++at) {
+  size_t at = 0;
+  for (; at < tile.count && alive != 0; ++at) {
     const Entry entry = tile.entries[at];
     const Splat& splat = tile.splats[entry.splat];
     const float* value = tile.values + static_cast<size_t>(entry.splat) * tile.channels + tile.first;
-    Vec sum = {}, sum_x = {}, sum_y = {}, sum_xx = {}, sum_xy = {}, sum_yy = {}, of_value[C] = {};
+    Vec sums[kRow] = {};  // of values, opacity, and x, y, xx, xy, yy about the centre
     for (uint32_t left = entry.blocks & alive; left != 0; left &= left - 1) {
       const int block = __builtin_ctz(left);
       const Step step = step_of(splat, x[block], y[block], transmittance[block]);
       Vec worth = h[block];
       for (int channel = 0; channel < C; ++channel) {
         worth += g[block][channel] * value[channel];
-        of_value[channel] += step.weight * g[block][channel];
+        sums[channel] += step.weight * g[block][channel];
       }
       behind[block] -= step.weight * worth;
       const Vec of_alpha = transmittance[block] * worth - behind[block] / (1.0f - step.alpha);
       const Vec of_power = select(step.counts & step.unclamped, of_alpha * step.alpha, Vec{});
       transmittance[block] = step.next;
-      sum += of_power;
+      sums[C] += of_power;
       if constexpr (kGeometry) {
         const Vec x_part = of_power * step.dx, y_part = of_power * step.dy;
-        sum_x += x_part;
-        sum_y += y_part;
-        sum_xx += x_part * step.dx;
-        sum_xy += x_part * step.dy;
-        sum_yy += y_part * step.dy;
+        sums[C + 1] += x_part;
+        sums[C + 2] += y_part;
+        sums[C + 3] += x_part * step.dx;
+        sums[C + 4] += x_part * step.dy;
+        sums[C + 5] += y_part * step.dy;
       }
       if (bits_of(step.next > 0.0f) == 0) alive &= ~(1u << block);
     }
-    for (int channel = 0; channel < C; ++channel) value_gradients[at * C + channel] = sum_of(of_value[channel]);
-    SplatGradient& out = splat_gradients[at];
-    out.opacity += sum_of(sum) / splat.opacity;
+    float* out = rows + at * kRow;
+    sums_of<kRow>(sums, out);
+    out[C] /= splat.opacity;
     if constexpr (kGeometry) {
-      const float along_x = sum_of(sum_x), along_y = sum_of(sum_y);
-      out.x += splat.a * along_x + splat.b * along_y;
-      out.y += splat.b * along_x + splat.c * along_y;
-      out.a -= 0.5f * sum_of(sum_xx);
-      out.b -= sum_of(sum_xy);
-      out.c -= 0.5f * sum_of(sum_yy);
+      const float along_x = out[C + 1], along_y = out[C + 2];
+      out[C + 1] = splat.a * along_x + splat.b * along_y;
+      out[C + 2] = splat.b * along_x + splat.c * along_y;
+      out[C + 3] *= -0.5f;
+      out[C + 4] *= -1.0f;
+      out[C + 5] *= -0.5f;
     }
   }
+  std::memset(rows + at * kRow, 0, (tile.count - at) * kRow * sizeof(float));
 }
 
 void blend(const Tile& tile, float* picture, float* weight) {
@@ -183,16 +196,16 @@ void blend(const Tile& tile, float* picture, float* weight) {
 
 template <int C>
 void choose_geometry(const Tile& tile, const float* picture, const float* weight, const float* picture_gradient,
-                     const float* weight_gradient, bool geometry, float* value_gradients, SplatGradient* splats) {
+                     const float* weight_gradient, bool geometry, float* rows) {
   if (geometry) {
-    blend_channels_backward<C, true>(tile, picture, weight, picture_gradient, weight_gradient, value_gradients, splats);
+    blend_channels_backward<C, true>(tile, picture, weight, picture_gradient, weight_gradient, rows);
   } else {
-    blend_channels_backward<C, false>(tile, picture, weight, picture_gradient, weight_gradient, value_gradients, splats);
+    blend_channels_backward<C, false>(tile, picture, weight, picture_gradient, weight_gradient, rows);
   }
 }
 
 void blend_backward(const Tile& tile, const float* picture, const float* weight, const float* picture_gradient,
-                    const float* weight_gradient, bool geometry, float* value_gradients, SplatGradient* splats) {
+                    const float* weight_gradient, bool geometry, float* rows) {
   const auto chosen = [&] {
     switch (tile.chunk) {
       case 1: return choose_geometry<1>;
@@ -203,7 +216,7 @@ void blend_backward(const Tile& tile, const float* picture, const float* weight,
       default: return choose_geometry<8>;
     }
   }();
-  chosen(tile, picture, weight, picture_gradient, weight_gradient, geometry, value_gradients, splats);
+  chosen(tile, picture, weight, picture_gradient, weight_gradient, geometry, rows);
 }
 
 }  // namespace

@@ -35,6 +35,17 @@ RF_INLINE Vec gather(const float* from, const size_t* index, int stride, int col
   return load(lanes);
 }
 
+// 2 ln(opacity / cut), where alpha falls to the cut, for opacities from the cut to one. With x = 2^e m and m between
+// sqrt(1/2) and sqrt(2), ln m = 2 artanh s, s = (m - 1) / (m + 1).
+RF_INLINE Vec reach_of(Vec opacity) {
+  const Vec x = max_vec(opacity * (1.0f / kAlphaMin), splat_vec(1.0f));
+  const IntVec bits = int_bits(x);
+  const IntVec exponent = (bits + -0x3f3504f3) & -0x800000;
+  const Vec m = float_bits(bits - exponent), s = (m - 1.0f) / (m + 1.0f), ss = s * s;
+  const Vec series = 1.0f + ss * (1.0f / 3.0f + ss * (0.2f + ss * (1.0f / 7.0f + ss * (1.0f / 9.0f))));
+  return 4.0f * s * series + to_float(exponent) * (2.0f * 0.693147180559945f / 0x800000);
+}
+
 RF_INLINE IntVec is_finite(Vec value) { return (int_bits(value) & 0x7f800000) != 0x7f800000; }
 
 RF_INLINE bool all_finite(const float* values, int count) {
@@ -131,19 +142,21 @@ size_t project(const View& view, const Parameters& in, size_t begin, size_t end,
     const Vec a = p.syy * p.inverse_determinant, b = -p.sxy * p.inverse_determinant;
     const Vec c = p.sxx * p.inverse_determinant;
     fine &= is_finite(a) & is_finite(b) & is_finite(c) & is_finite(major);
-    const uint32_t bits = bits_of(fine);
-    for (int lane = 0; lane < lanes; ++lane) {
-      radii[start + lane] = 0.0f;
-      if (!(bits >> lane & 1u)) continue;
-      const float squared = opacity[lane] > kAlphaMin ? 2.0f * __builtin_logf(opacity[lane] / kAlphaMin) : 0.0f;
-      const float reach = __builtin_sqrtf(squared);
-      const float x = p.screen_x[lane], y = p.screen_y[lane];
-      const float box_x = reach * deviation_x[lane], box_y = reach * deviation_y[lane];
-      const bool in_picture = x + box_x > 0.0f && x - box_x < view.width && y + box_y > 0.0f && y - box_y < view.height;
-      if (!in_picture || !all_finite(in.values + (start + lane) * in.channels, in.channels)) continue;
-      radii[start + lane] = reach * deviation[lane];
-      splats[visible] = {x, y, a[lane], b[lane], c[lane], opacity[lane], squared, static_cast<uint32_t>(start + lane)};
-      extents[visible] = {box_x, box_y, p.z[lane]};
+    const Vec squared = reach_of(opacity), reach = sqrt_vec(squared);
+    const Vec box_x = reach * deviation_x, box_y = reach * deviation_y;
+    fine &= (p.screen_x + box_x > 0.0f) & (p.screen_x - box_x < static_cast<float>(view.width));
+    fine &= (p.screen_y + box_y > 0.0f) & (p.screen_y - box_y < static_cast<float>(view.height));
+    for (int lane = 0; lane < lanes; ++lane) radii[start + lane] = 0.0f;
+    alignas(64) float of[11][kLanes];
+    const Vec parts[11] = {p.screen_x, p.screen_y, a, b, c, opacity, squared, box_x, box_y, p.z, reach * deviation};
+    for (int part = 0; part < 11; ++part) store(of[part], parts[part]);
+    for (uint32_t left = bits_of(fine) & ((1u << lanes) - 1u); left != 0; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      if (!all_finite(in.values + (start + lane) * in.channels, in.channels)) continue;
+      splats[visible] = {of[0][lane], of[1][lane], of[2][lane], of[3][lane],
+                         of[4][lane], of[5][lane], of[6][lane], static_cast<uint32_t>(start + lane)};
+      extents[visible] = {of[7][lane], of[8][lane], of[9][lane]};
+      radii[start + lane] = of[10][lane];
       ++visible;
     }
   }

@@ -9,7 +9,7 @@
 #define RF3DGS_DEFINE_KERNELS(function, name)                                                                  \
   namespace rf3dgs {                                                                                           \
   const Kernels& function() {                                                                                  \
-    static constexpr Kernels table = {name,  ::project, ::project_backward, ::blocks_reached,                  \
+    static constexpr Kernels table = {name,  ::project, ::project_backward, ::tiles_reached,                   \
                                       ::blend, ::blend_backward, ::harmonics, ::harmonics_backward,            \
                                       ::ssim_row, ::ssim_gradient_row};                                        \
     return table;                                                                                              \

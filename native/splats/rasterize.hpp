@@ -1,8 +1,9 @@
 // The rasterizer: Gaussians in, picture out, and back.
 //
 // Forward: project, sort by view depth (ties by index), list for every 16x16 tile the splats that reach it, blend.
-// Backward: blend once more per tile into gradients per list entry, add these per Gaussian in the order of the tiles,
-// take them back through the projection. Every sum has one order, so results do not depend on the number of threads.
+// Backward: blend once more per tile into a row of gradients per list entry, add these per Gaussian in the order of the
+// tiles, take them back through the projection. Only the lists are in depth order: the splats and all that is kept for
+// them stay in the order of the Gaussians, so that memory is read as it lies. Every sum has one order, so results do not depend on the number of threads.
 #pragma once
 
 #include <memory>
@@ -18,7 +19,7 @@ struct Scene {
   size_t gaussians = 0;
   int channels = 0;
   int tiles_x = 0, tiles_y = 0;
-  std::vector<Splat> splats;         // in depth order
+  std::vector<Splat> splats;         // the visible ones in the order of the Gaussians
   std::vector<float> values;         // [splat, channel]
   std::vector<Entry> entries;        // tile by tile, front to back
   std::vector<size_t> tile_start;    // [tile + 1]
