@@ -1,3 +1,5 @@
+"""Paths made by hand, for the tests of every layer."""
+
 import math
 
 import pytest
