@@ -47,5 +47,23 @@ _MODULES = {
     "evaluate": ".evaluation.protocol",
     "view": ".viewer.app",
 }
-__all__ = [*_MODULES]
+__all__ = [  # noqa: RUF022 (reading order)
+    "Pose",
+    "DirectionGrid",
+    "pinhole_grid",
+    "equirect_grid",
+    "Paths",
+    "planar_array",
+    "ofdm",
+    "Spectrum",
+    "spectrum_of",
+    "propagation",
+    "Dataset",
+    "Gaussians",
+    "fit_geometry",
+    "fit_radio",
+    "RadioField",
+    "evaluate",
+    "view",
+]
 __getattr__, __dir__ = lazy_names(__name__, _MODULES)

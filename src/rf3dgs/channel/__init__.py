@@ -36,5 +36,20 @@ _HOMES = {
     "PathsWriter": ".io",
     "PathsReader": ".io",
 }
-__all__ = list(_HOMES)
+__all__ = [  # noqa: RUF022 (reading order)
+    "Paths",
+    "planar_array",
+    "PlanarArray",
+    "ofdm",
+    "power_pattern",
+    "manifold",
+    "cfr",
+    "cir",
+    "bin_diffuse",
+    "stack_paths",
+    "save_paths",
+    "load_paths",
+    "PathsWriter",
+    "PathsReader",
+]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -30,5 +30,17 @@ _HOMES = {
     "render_photos": ".photographer",
     "find_llvm": ".llvm",
 }
-__all__ = list(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
+__all__ = [  # noqa: RUF022 (reading order)
+    "Scene",
+    "SceneObject",
+    "scene_of",
+    "write_radio_scene",
+    "write_visual_scene",
+    "TraceConfig",
+    "sionna",
+    "PhotoConfig",
+    "camera_tour",
+    "render_photos",
+    "find_llvm",
+]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

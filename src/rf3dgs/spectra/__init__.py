@@ -42,5 +42,23 @@ _HOMES = {
     "main_peak": ".peaks",
     "resample": ".resampling",
 }
-__all__ = list(_HOMES)
+__all__ = [  # noqa: RUF022 (reading order)
+    "Spectrum",
+    "Instrument",
+    "spectrum_of",
+    "default_lobe",
+    "array_instrument",
+    "covariance_of",
+    "covariance_of_spectrum",
+    "bartlett",
+    "tapered",
+    "capon",
+    "hann_taper",
+    "DbWindow",
+    "window_of",
+    "PaperEncoding",
+    "find_peaks",
+    "main_peak",
+    "resample",
+]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)
