@@ -12,6 +12,7 @@ from PIL import Image
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose, opengl_from_viewmat
 from rf3dgs.core.grids import Camera, pinhole_grid
+from rf3dgs.data.dataset import Dataset
 from rf3dgs.data.formats.blender import read_blender
 from rf3dgs.data.formats.colmap import read_colmap, read_model, write_colmap
 from rf3dgs.data.formats.detect import read_photos
@@ -288,6 +289,19 @@ def test_rf3dgs_v0_without_units_says_what_to_supply(photos, tmp_path):
     (site / "test_index.txt").write_text("004\n")
     with pytest.raises(DataError, match=r"1 pictures are in neither index file, such as '005\.png'"):
         read_photos(site)
+
+
+def test_photos_of_a_dataset_keep_the_roles_of_its_split(dataset, tmp_path):
+    saved = tmp_path / "site"
+    dataset.split(seed=1, photo_test_every=3).save(saved)
+    assert read_photos(saved).roles == ("train", "train", "test") * 2
+    assert Dataset.load(saved).photo_roles == read_photos(saved).roles
+    dataset.save(tmp_path / "whole")
+    assert read_photos(tmp_path / "whole").roles is None
+    manifest = saved / "dataset.json"
+    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"photo_roles": ["train"]}))
+    with pytest.raises(DataError, match=r"dataset.json: expected one role per photo, 6; got 1. Save the dataset again"):
+        read_photos(saved)
 
 
 def test_read_photos_says_which_layout_it_found(photos, saved, tmp_path):

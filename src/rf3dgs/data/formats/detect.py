@@ -5,17 +5,16 @@ from pathlib import Path
 from rf3dgs.core.errors import DataError
 from rf3dgs.data.formats.blender import files_of, read_blender
 from rf3dgs.data.formats.colmap import model_folder, read_colmap
+from rf3dgs.data.formats.native import MANIFEST, photo_roles
 from rf3dgs.data.formats.nerfstudio import FILE_NAME, read_nerfstudio
 from rf3dgs.data.formats.rf3dgs_v0 import is_rf3dgs_v0, read_rf3dgs_v0_pictures
 from rf3dgs.data.photo import PhotoSet
 
-LAYOUTS = ("native", "nerfstudio", "blender", "rf3dgs_v0", "colmap")
-
 
 def layout_of(path: str | Path) -> str | None:
-    """The layout of a folder, one of `LAYOUTS`, or None: the first whose files are there."""
+    """The first layout whose files a folder has: "native", "nerfstudio", "blender", "rf3dgs_v0", "colmap", or None."""
     path = Path(path)
-    if (path / "dataset.json").is_file():
+    if (path / MANIFEST).is_file():
         return "native"
     if (path / FILE_NAME).is_file():
         return "nerfstudio"
@@ -37,7 +36,8 @@ def read_photos(path: str | Path) -> PhotoSet:
         if not (folder / FILE_NAME).is_file():
             raise DataError(f"{path}: this dataset has no photographs; add some, or take the geometry from a mesh")
         found = read_nerfstudio(folder)
-        return PhotoSet(found.photos, layout, notes=found.notes)
+        roles = photo_roles(path, len(found)) if layout == "native" else None
+        return PhotoSet(found.photos, layout, roles=roles, notes=found.notes)
     if layout == "blender":
         return read_blender(path)
     if layout == "rf3dgs_v0":

@@ -113,6 +113,15 @@ def read_manifest(path: Path) -> dict[str, Any]:
     return manifest
 
 
+def photo_roles(path: Path, count: int) -> tuple[str, ...] | None:
+    """The roles of a dataset folder's `count` photos, None before a split; DataError for another number of roles."""
+    file = path / MANIFEST
+    roles = _texts(read_manifest(path), "photo_roles", file)
+    if roles and len(roles) != count:
+        raise DataError(f"{file}: expected one role per photo, {count}; got {len(roles)}. Save the dataset again")
+    return roles or None
+
+
 def check_sha256(path: Path, expected: str) -> None:
     """DataError when a file is missing or is not the one that `dataset.json` describes."""
     if sha256_of(path) != expected:
