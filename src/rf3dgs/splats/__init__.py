@@ -1,4 +1,7 @@
-"""Gaussian splatting for photographs and spectra alike: the Gaussians, how they are drawn, grown, pruned and stored."""
+"""Gaussian splatting for photographs and spectra alike: the Gaussians, how they are drawn, grown, pruned and stored.
+
+`rasterize.rasterize` bears the name of its module and is imported from there.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -15,7 +18,6 @@ if TYPE_CHECKING:
     from rf3dgs.splats.ply import write_ply as write_ply
     from rf3dgs.splats.raster import Raster as Raster
     from rf3dgs.splats.rasterize import pick_backend as pick_backend
-    from rf3dgs.splats.rasterize import rasterize as rasterize
     from rf3dgs.splats.reference import rasterize_reference as rasterize_reference
     from rf3dgs.splats.surface import sample_mesh as sample_mesh
     from rf3dgs.splats.transmittance import segment_transmittance as segment_transmittance
@@ -23,7 +25,6 @@ if TYPE_CHECKING:
 __all__ = [  # noqa: RUF022
     "Gaussians",
     "Raster",
-    "rasterize",
     "pick_backend",
     "rasterize_reference",
     "l1_ssim",
@@ -41,7 +42,6 @@ __getattr__, __dir__ = lazy_names(
     {
         "Gaussians": ".gaussians",
         "Raster": ".raster",
-        "rasterize": ".rasterize",
         "pick_backend": ".rasterize",
         "rasterize_reference": ".reference",
         "l1_ssim": ".image_loss",
