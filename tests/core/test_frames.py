@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -100,6 +101,25 @@ def test_bad_poses_are_refused_with_a_remedy() -> None:
         Pose.from_matrix((0.0, 0.0, 0.0), torch.diag(torch.tensor([1.0, 1.0, -1.0])))
     with pytest.raises(InputError, match="both are the same point"):
         Pose.look_at((1.0, 1.0, 1.0), (1.0, 1.0, 1.0))
+
+
+def test_batches_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(InputError, match=r"fit together; got \[5, 3\] and \[4, 4\]. Give one orientation"):
+        Pose(torch.zeros(5, 3), torch.ones(4, 4))
+
+
+def test_a_pose_keeps_its_place_when_the_callers_array_changes() -> None:
+    place = np.array([1.0, 2.0, 3.0], dtype=np.float32)
+    pose = Pose(place)
+    place[:] = 9.0
+    assert pose.position.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_flat_poses_are_the_same_poses_in_one_row() -> None:
+    pose = Pose(torch.randn(2, 3, 3), random_quaternions(3))
+    assert torch.equal(pose.flat()[4].position, pose.position[1, 1])
+    assert torch.equal(pose.flat()[4].orientation, pose.orientation[1, 1])
+    assert len(Pose((1.0, 2.0, 3.0)).flat()) == 1
 
 
 def test_scatter_is_seeded_and_stays_inside() -> None:

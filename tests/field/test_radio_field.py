@@ -175,6 +175,8 @@ def test_the_field_marks_receivers_outside_its_training(field):
 def test_errors_say_what_to_do(field):
     with pytest.raises(InputError, match="strongest must be at least 1; got 0"):
         field.paths(HERE, strongest=0)
+    with pytest.raises(InputError, match="paths needs at least one pose; got an empty batch"):
+        field.paths(Pose(torch.zeros(0, 3)))
     with pytest.raises(InputError, match="at least one pose"):
         field.render(Pose(torch.zeros(0, 3)), equirect_grid(8, 4))
     with pytest.raises(InputError, match='"vector" or "paper"'):

@@ -114,8 +114,7 @@ class Paths:
     def flat(self) -> "Paths":
         """The same paths with one receiver axis `[rx, path]`, however many batch axes there are."""
         shape = (math.prod(self.coeff.shape[:-1]), self.coeff.shape[-1])
-        rx = Pose(self.rx.position.reshape(-1, 3), self.rx.orientation.reshape(-1, 4))
-        return self._map(lambda value: value.reshape(shape), rx=rx)
+        return self._map(lambda value: value.reshape(shape), rx=self.rx.flat())
 
     def strongest(self, count: int) -> "Paths":
         """The `count` strongest paths of each receiver, strongest first."""

@@ -68,12 +68,13 @@ def is_rotation(matrix: Tensor, *, tolerance: float = 1e-4) -> Tensor:
     return orthonormal & (torch.linalg.det(matrix) > 0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pose:
     """Where a device stands and how it is turned, in the world frame.
 
     `position` `[*batch, 3]` [m]; `orientation` `[*batch, 4]`, the unit quaternion `wxyz` of `world_from_device`
-    (device x forward, y left, z up). The two are broadcast against each other.
+    (device x forward, y left, z up). The two are broadcast against each other; both are copied, so that a pose stays
+    what it was when the caller's array changes.
     """
 
     position: Tensor
@@ -91,8 +92,14 @@ class Pose:
         length = torch.linalg.vector_norm(orientation, dim=-1, keepdim=True)
         if not bool((torch.isfinite(length) & (length > 1e-6)).all()):
             raise InputError("orientation has a zero or non-finite quaternion; use (1, 0, 0, 0) for no rotation")
-        batch = np.broadcast_shapes(position.shape[:-1], orientation.shape[:-1])  # torch's own would import sympy
-        object.__setattr__(self, "position", position.expand(*batch, 3))
+        try:  # torch's own broadcast_shapes would import sympy
+            batch = np.broadcast_shapes(position.shape[:-1], orientation.shape[:-1])
+        except ValueError as error:
+            raise InputError(
+                f"position and orientation must have batches that fit together; got {list(position.shape)} and "
+                f"{list(orientation.shape)}. Give one orientation, or one for each position"
+            ) from error
+        object.__setattr__(self, "position", position.clone().expand(*batch, 3))
         object.__setattr__(self, "orientation", (orientation / length).expand(*batch, 4))
 
     @classmethod
@@ -166,6 +173,10 @@ class Pose:
     @property
     def batch_shape(self) -> tuple[int, ...]:
         return tuple(self.position.shape[:-1])
+
+    def flat(self) -> "Pose":
+        """The same poses with one axis `[pose]`, however many batch axes they have; one pose becomes a list of one."""
+        return Pose(self.position.reshape(-1, 3), self.orientation.reshape(-1, 4))
 
     def __getitem__(self, index: int | slice | Tensor) -> "Pose":
         if not self.batch_shape:

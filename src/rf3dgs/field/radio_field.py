@@ -74,7 +74,7 @@ class RadioField:
         `csi=False` leaves delay and departure out, which is faster.
         """
         batch = pose.batch_shape
-        flat = Pose(pose.position.reshape(-1, 3), pose.orientation.reshape(-1, 4))
+        flat = pose.flat()
         if len(flat) == 0:
             raise InputError("render needs at least one pose; got an empty batch")
         parts = [self._render_one(flat[index], grid, csi) for index in range(len(flat))]
@@ -95,7 +95,9 @@ class RadioField:
         """
         if strongest < 1:
             raise InputError(f"strongest must be at least 1; got {strongest}")
-        flat = Pose(pose.position.reshape(-1, 3), pose.orientation.reshape(-1, 4))
+        flat = pose.flat()
+        if len(flat) == 0:
+            raise InputError("paths needs at least one pose; got an empty batch")
         rows = [self._paths_of_one(flat[index], strongest) for index in range(len(flat))]
         table = torch.stack(rows).reshape(*pose.batch_shape, strongest, 9)
         aoa_zenith, aoa_azimuth = angles_of(table[..., 2:5])
@@ -180,7 +182,7 @@ class RadioField:
         assert surface.delay is not None
         assert surface.aod is not None
         directions, gains = find_peaks(surface.power, grid, count=strongest, separation=lobe)
-        (x, y), _ = (value.unbind(-1) if value.dim() > 1 else value for value in grid.pixel_of(directions))
+        x, y = grid.pixel_of(directions)[0].unbind(-1)
         row, col = y.long().clamp(0, grid.height - 1), x.long().clamp(0, grid.width - 1)
         found = (
             torch.stack((gains, surface.delay[row, col]), -1),
