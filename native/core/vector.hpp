@@ -207,6 +207,14 @@ RF_INLINE uint32_t bits_of(IntVec mask) {
 #endif
 }
 
+RF_INLINE bool any_positive(const Vec& value) {
+#if defined(__AVX512F__)
+  return _mm512_cmp_ps_mask((__m512)value, _mm512_setzero_ps(), _CMP_GT_OQ) != 0;
+#else
+  return bits_of(value > 0.0f) != 0;
+#endif
+}
+
 // The sum of all lanes, always added in the same order.
 RF_INLINE float sum_of(Vec value) {
   typedef float Vec8 __attribute__((vector_size(32)));

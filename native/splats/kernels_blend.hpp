@@ -90,7 +90,7 @@ void blend_channels(const Tile& tile, float* picture, float* weight) {
       const Step step = step_of(splat, x[block], y[block], transmittance[block]);
       transmittance[block] = step.next;
       for (int channel = 0; channel < C; ++channel) colour[block][channel] += step.weight * value[channel];
-      if (bits_of(step.next > 0.0f) == 0) alive &= ~(1u << block);
+      if (!any_positive(step.next)) alive &= ~(1u << block);
     }
   }
   for (int block = 0; block < kBlocks; ++block) {
@@ -166,7 +166,7 @@ void blend_channels_backward(const Tile& tile, const float* picture, const float
         sums[C + 4] += x_part * step.dy;
         sums[C + 5] += y_part * step.dy;
       }
-      if (bits_of(step.next > 0.0f) == 0) alive &= ~(1u << block);
+      if (!any_positive(step.next)) alive &= ~(1u << block);
     }
     float* out = rows + at * kRow;
     sums_of<kRow>(sums, out);

@@ -3,7 +3,8 @@
 // Forward: project, sort by view depth (ties by index), list for every 16x16 tile the splats that reach it, blend.
 // Backward: blend once more per tile into a row of gradients per list entry, add these per Gaussian in the order of the
 // tiles, take them back through the projection. Only the lists are in depth order: the splats and all that is kept for
-// them stay in the order of the Gaussians, so that memory is read as it lies. Every sum has one order, so results do not depend on the number of threads.
+// them stay in the order of the Gaussians, so that memory is read as it lies. Every sum has one order, so results do not depend on the
+// number of threads.
 #pragma once
 
 #include <memory>
