@@ -156,3 +156,13 @@ def test_tables_stay_within_their_width() -> None:
     text = table([("name", "value " * 40), ("longer name", "x")], width=60)
     assert all(len(line) <= 60 for line in text.splitlines())
     assert text.splitlines()[-1].split() == ["longer", "name", "x"]
+
+
+def test_photos_never_replace_a_folder_of_something_else(tmp_path, capsys):
+    folder = tmp_path / "holiday"
+    folder.mkdir()
+    (folder / "00000.jpg").touch()
+    (folder / "diary.txt").write_text("dear diary")
+    assert main(["photos", "lobby", "--out", str(folder)]) == 2
+    assert "holds something else than a tour, such as diary.txt; choose another name" in capsys.readouterr().err
+    assert (folder / "diary.txt").read_text() == "dear diary"

@@ -196,6 +196,16 @@ def test_an_xml_file_is_read_with_its_meshes(tracer, site, tmp_path):
     assert int(paths.count[0]) > 1
 
 
+def test_a_file_named_like_a_built_in_scene_is_its_own_site(tracer, site, tmp_path):
+    from rf3dgs.propagation.scene_files import write_radio_scene
+
+    few = replace(site, objects=(site["wall-west"], site["wall-north"]))
+    again = scene_of(write_radio_scene(few, tmp_path).rename(tmp_path / "box.xml"))
+    low, high = (torch.tensor(corner) for corner in again.bounds)
+    assert again.name == "box"
+    assert bool(((again.tx.position > low) & (again.tx.position < high)).all())
+
+
 def plain(inner: str) -> str:
     return f'<scene version="2.1.0">{inner}</scene>'
 

@@ -1,5 +1,6 @@
 """`trace`, `photos` and `spectra`: from a scene to a dataset folder."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -60,7 +61,7 @@ class MakePhotos:
     tour_seed: int = 0
     """Decides where the cameras stand."""
     out: Path = Path("lobby/photos")
-    """The folder to write: pictures and transforms.json."""
+    """The folder to write: pictures and transforms.json; a tour already there is replaced."""
     photo: PhotoConfig = field(default_factory=PhotoConfig)
     """How photographs are rendered."""
 
@@ -73,6 +74,7 @@ class MakePhotos:
 
         if self.count < 1:
             raise InputError(f"--count must be at least 1; got {self.count}")
+        _refuse_other_folder(self.out)
         scene = open_scene(self.scene)
         with atomic_folder(self.out) as folder:
             photos = photograph(scene, self.count, self.tour_seed, self.photo, folder, console())
@@ -133,6 +135,19 @@ class MakeSpectra:
         Dataset(photos, stack_spectra(spectra), meta=meta).split(seed=self.seed).save(self.out)
         out(f"{self.out}: {len(spectra)} spectra of {grid.width}x{grid.height}, {len(photos)} photographs")
         return 0
+
+
+def _refuse_other_folder(folder: Path) -> None:
+    """Refuse to replace a folder that holds anything but an earlier tour."""
+    from rf3dgs.data.formats.nerfstudio import FILE_NAME
+
+    items = folder.iterdir() if folder.is_dir() else ()
+    others = sorted(item.name for item in items if not re.fullmatch(rf"\d{{5}}\.jpg|{re.escape(FILE_NAME)}", item.name))
+    if others:
+        raise InputError(
+            f"{folder} would be replaced, but it holds something else than a tour, such as {others[0]}; choose another "
+            "name with --out"
+        )
 
 
 def _size_of(array: str) -> tuple[int, int]:

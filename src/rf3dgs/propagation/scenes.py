@@ -23,7 +23,6 @@ class Site:
     rx_bounds: Bounds
     camera_bounds: Bounds
     frequency: float = 28e9
-    shell: str | None = None
 
 
 SITES: Mapping[str, Site] = {
@@ -60,18 +59,19 @@ def scene_of(name_or_xml: str | Path | Scene, *, scattering: float | None = None
         return lobby()
     if Path(name).suffix.lower() == ".xml":
         check_foreign_xml(name)
-        return _read(Path(name).stem, Path(name), scattering or 0.0)
+        return _read(Path(name).stem, Path(name), scattering or 0.0, None)
     from rf3dgs.propagation.sionna import import_sionna
 
     folder = Path(import_sionna().__file__).parent / "scenes"
     known = sorted(path.parent.name for path in folder.glob("*/*.xml"))
     if name not in known:
         raise InputError(f"no scene is named {name!r}; use lobby, an .xml file, or one of Sionna's: {', '.join(known)}")
-    return _read(name, folder / name / f"{name}.xml", FOREIGN_SCATTERING if scattering is None else scattering)
+    amplitude = FOREIGN_SCATTERING if scattering is None else scattering
+    return _read(name, folder / name / f"{name}.xml", amplitude, SITES.get(name))
 
 
-def _read(name: str, path: Path, scattering: float) -> Scene:
-    """A scene whose meshes and materials are read from a Sionna XML file."""
+def _read(name: str, path: Path, scattering: float, site: Site | None) -> Scene:
+    """A scene whose meshes and materials are read from a Sionna XML file; without a `site` its middle is taken."""
     from rf3dgs.propagation.llvm import mitsuba_variant
     from rf3dgs.propagation.sionna import VARIANT, import_sionna
 
@@ -89,7 +89,7 @@ def _read(name: str, path: Path, scattering: float) -> Scene:
     shells = [item.name for item in objects if _is_shell(item, low, high)]
     objects = [replace(item, solid=item.name not in shells and _is_closed(item)) for item in objects]
     open_sky = not any(item.name in shells and _is_closed(item) for item in objects)
-    site = SITES.get(name) or _middle(low, high)
+    site = _middle(low, high) if site is None else site
     headroom = 50.0 if open_sky else 0.0
     bounds = (low - 0.01).tolist(), (high + torch.tensor([0.01, 0.01, 0.01 + headroom])).tolist()
     return Scene(
