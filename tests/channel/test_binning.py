@@ -7,6 +7,7 @@ import torch
 from rf3dgs.channel.binning import bin_diffuse, stack_paths
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
+from rf3dgs.core.frames import Pose
 from rf3dgs.core.units import db_from_power
 
 
@@ -56,6 +57,13 @@ def test_receivers_are_padded_and_invalid_paths_vanish(random_paths):
     assert merged.coeff.shape[0] == 2
     assert int(merged.count[1]) <= 40
     assert torch.allclose(merged.total_gain, torch.stack((first.total_gain, second.total_gain)), rtol=1e-5)
+
+
+def test_paths_of_different_sources_are_not_stacked(random_paths):
+    first = random_paths(5)
+    for other in (replace(first, frequency=28e9), replace(first, tx=Pose([1.0, 0.0, 2.0]))):
+        with pytest.raises(InputError, match=r"different frequencies or transmitters .* Keep them apart"):
+            stack_paths([first, other])
 
 
 def test_kinds_are_needed(random_paths):

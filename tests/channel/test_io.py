@@ -51,6 +51,10 @@ def test_a_failed_writer_leaves_nothing_and_keeps_the_older_file(paths, tmp_path
     other = replace(paths, frequency=28e9)
     with pytest.raises(InputError, match="holds paths at"), PathsWriter(file, 60e9, paths.tx) as writer:
         writer.append(other)
+    other = replace(paths, tx=Pose([9.0, 0.0, 2.0]))
+    refused = pytest.raises(InputError, match=r"holds paths from .* Write one file per transmitter")
+    with refused, PathsWriter(file, 60e9, paths.tx) as writer:
+        writer.append(other)
     with pytest.raises(InputError, match="no receiver was written"), PathsWriter(file, 60e9, paths.tx):
         pass
     assert file.read_bytes() == before

@@ -37,15 +37,26 @@ def bin_diffuse(paths: Paths, *, cell: float = math.radians(1.0), delay_step: fl
 
 
 def stack_paths(rows: list[Paths]) -> Paths:
-    """One `Paths` `[rx, path]` of the paths of single receivers, padded with invalid entries to the longest."""
+    """One `Paths` `[rx, path]` of the paths of single receivers, padded with invalid entries to the longest.
+
+    InputError when they do not share one frequency and one transmitter.
+    """
     if not rows:
         raise InputError("stack_paths needs the paths of at least one receiver; got none")
+    first = rows[0]
+    for row in rows:
+        if row.frequency != first.frequency or not torch.equal(row.tx.position, first.tx.position):
+            raise InputError(
+                "paths of different frequencies or transmitters cannot be stacked; "
+                f"got {first.frequency:g} Hz from {first.tx.position.tolist()} and {row.frequency:g} Hz from "
+                f"{row.tx.position.tolist()}. Keep them apart"
+            )
     longest = max(row.coeff.shape[-1] for row in rows)
     names = ["coeff", "delay", "aoa_zenith", "aoa_azimuth", "aod_zenith", "aod_azimuth", "valid"]
     names += [name for name in ("order", "kind") if all(getattr(row, name) is not None for row in rows)]
     columns = {name: torch.stack([_padded(getattr(row, name), longest) for row in rows]) for name in names}
     rx = Pose(torch.stack([row.rx.position for row in rows]), torch.stack([row.rx.orientation for row in rows]))
-    return Paths(**columns, frequency=rows[0].frequency, tx=rows[0].tx, rx=rx)
+    return Paths(**columns, frequency=first.frequency, tx=first.tx, rx=rx)
 
 
 def _padded(value: Tensor, length: int) -> Tensor:

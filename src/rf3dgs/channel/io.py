@@ -84,6 +84,11 @@ class PathsWriter:
             raise InputError(f"append takes the paths of one or more receivers; got shape {list(paths.coeff.shape)}")
         if paths.frequency != self.frequency:
             raise InputError(f"{self.path} holds paths at {self.frequency} Hz; got {paths.frequency} Hz")
+        if not torch.equal(paths.tx.position, self.tx.position):
+            raise InputError(
+                f"{self.path} holds paths from {self.tx.position.tolist()}; got some from "
+                f"{paths.tx.position.tolist()}. Write one file per transmitter"
+            )
         columns = _columns(paths)
         if not all(np.isfinite(value).all() for value in columns.values()):
             raise InputError(f"paths for {self.path} have NaN or infinite values; mark such entries as not valid")
