@@ -44,6 +44,23 @@ def test_the_picture_follows_the_receiver(viewer: Viewer) -> None:
     assert "dB |" in viewer._text.content
 
 
+def test_a_position_that_cannot_be_drawn_does_not_end_the_viewer(viewer: Viewer, monkeypatch, caplog) -> None:
+    class Broken:
+        bounds = viewer.field.bounds
+
+        def render(self, *_, **__):
+            raise InputError("out of field")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(viewer, "field", Broken())
+        viewer.move((4.0, 4.0, 1.2))
+        assert until(lambda: viewer._text.content == "**This position cannot be drawn:** out of field")
+    assert "cannot be drawn" in caplog.text
+    drawn = viewer.drawn
+    viewer.move((5.0, 5.0, 1.2))
+    assert until(lambda: viewer.drawn > drawn)
+
+
 def test_it_listens_on_this_machine_only_and_says_when_a_port_is_taken(viewer: Viewer) -> None:
     assert viewer.url.startswith("http://127.0.0.1:")
     port = int(viewer.url.rsplit(":", 1)[1])

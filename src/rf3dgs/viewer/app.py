@@ -4,6 +4,7 @@ It listens on 127.0.0.1 only, because whoever reaches it can read the site's geo
 from a thread of its own, which always draws the newest position and drops those in between.
 """
 
+import logging
 import socket
 import threading
 import time
@@ -22,6 +23,7 @@ from rf3dgs.field.radio_field import RadioField
 
 HOST = "127.0.0.1"
 GRID = equirect_grid(180, 90)
+_log = logging.getLogger(__name__)
 
 
 def view(field: RadioField, *, port: int = 8080, wait: bool = True) -> "Viewer":
@@ -120,7 +122,12 @@ class Viewer:
             self._wanted.clear()
             if self._stopped.is_set():
                 return
-            self._draw(Pose(self.position.tolist()))
+            try:
+                self._draw(Pose(self.position.tolist()))
+            except Exception as error:  # whatever is wrong here, the next position may be drawn again
+                if not self._stopped.is_set():
+                    _log.exception("the receiver at %s cannot be drawn", self.position)
+                    self._text.content = f"**This position cannot be drawn:** {error}"
 
     def _draw(self, pose: Pose) -> None:
         began = time.perf_counter()
