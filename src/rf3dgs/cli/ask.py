@@ -95,7 +95,7 @@ class Csi:
     def run(self) -> int:
         """Extract the paths and write them."""
         from rf3dgs.cli.facts import open_field
-        from rf3dgs.core.files import atomic_file
+        from rf3dgs.core.files import atomic_file, write_whole
         from rf3dgs.core.frames import Pose
 
         if self.strongest < 1:
@@ -115,8 +115,7 @@ class Csi:
         if self.out is None:
             out(text)
         else:
-            with atomic_file(self.out) as temporary:
-                temporary.write_text(text + "\n")
+            write_whole(self.out, (text + "\n").encode())
         warn_if_outside(field, pose)
         return 0
 

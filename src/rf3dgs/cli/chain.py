@@ -23,9 +23,8 @@ from rf3dgs.propagation.config import PhotoConfig, TraceConfig
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
 from rf3dgs.splats.gaussians import Gaussians
-from rf3dgs.splats.harmonics import view_values
-from rf3dgs.splats.rasterize import rasterize
 from rf3dgs.splats.surface import sample_mesh
+from rf3dgs.training.photographs import render_photo
 
 if TYPE_CHECKING:
     from rf3dgs.field.radio_field import RadioField
@@ -86,7 +85,7 @@ def make_dataset(
     again = replace(trace, seed=trace.seed + REPEAT_SEED, rays=round(trace.rays * REPEAT_RAYS))
     repeat = spectra_of_scene(scene, rx[index], grid, again, progress)
     meta = {
-        "generator": f"scene {scene.name}, {trace.rays} rays, depth {trace.depth}; {photos} photographs",
+        "generator": f"scene {scene.name}, {trace.passes} x {trace.rays} rays, depth {trace.depth}; {photos} photographs",
         "seed": seed,
         "repeat": {"rays": again.rays, "seed": again.seed},
     }
@@ -94,7 +93,8 @@ def make_dataset(
     with tempfile.TemporaryDirectory(dir=folder.parent) as temporary:
         pictures = photograph(scene, photos, seed, photo, Path(temporary), progress) if photos else []
         whole = Dataset(pictures, spectra, repeat=repeat, repeat_index=index, meta=meta)
-        return whole.split(seed=seed).save(folder)
+        # The tour's pitches repeat every eight photographs, so every seventh is held out.
+        return whole.split(seed=seed, photo_test_every=7).save(folder)
 
 
 def geometry_of_mesh(scene: "Scene", count: int, seed: int) -> Gaussians:
@@ -105,15 +105,7 @@ def geometry_of_mesh(scene: "Scene", count: int, seed: int) -> Gaussians:
 
 def photo_pairs(geometry: Gaussians, photos: Sequence[Photo]) -> list[PhotoPair]:
     """Held-out photographs beside their renderings."""
-    pairs = []
-    with torch.no_grad():
-        for photo in photos:
-            values = view_values(geometry.sh, geometry.means, photo.camera.position, offset=0.5, clamp=True)
-            raster = rasterize(
-                geometry.means, geometry.quats, geometry.scales, geometry.opacities, values, photo.camera
-            )
-            pairs.append(PhotoPair(photo.name, photo.load(), raster.values.clamp(0, 1)))
-    return pairs
+    return [PhotoPair(photo.name, photo.load(), render_photo(geometry, photo.camera)) for photo in photos]
 
 
 def evaluate_parts(

@@ -32,7 +32,7 @@ class Eval:
         """Evaluate, print the table, write the report."""
         from rf3dgs.cli.chain import evaluate_parts, report_inputs
         from rf3dgs.cli.facts import open_dataset, open_field
-        from rf3dgs.core.files import atomic_file
+        from rf3dgs.core.files import write_whole
         from rf3dgs.evaluation.report import write_report
         from rf3dgs.evaluation.table import format_table
         from rf3dgs.splats.ply import read_ply
@@ -59,9 +59,8 @@ class Eval:
         )
         write_report(self.out, inputs)
         if self.json_out is not None:
-            with atomic_file(self.json_out) as temporary:
-                content = {name: evaluation.as_dict() for name, evaluation in evaluations.items()}
-                temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+            content = {name: evaluation.as_dict() for name, evaluation in evaluations.items()}
+            write_whole(self.json_out, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
         out(format_table(evaluations))
         out(f"report: {self.out}")
         return 0

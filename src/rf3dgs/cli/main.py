@@ -43,7 +43,7 @@ answers, at any receiver pose, which paths arrive from where, how strong, how la
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit status: 0 good, 1 found faults, 2 an error, 130 interrupted."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
-    if list(arguments) in (["--version"], ["version"]):
+    if arguments in (["--version"], ["version"]):
         print(f"rf3dgs {__version__}")  # noqa: T201
         return 0
     # torch's idle OpenMP threads spin for milliseconds after every operation; on a shared or small machine that costs
@@ -54,8 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Command,  # type: ignore[arg-type]
         prog="rf3dgs",
         description=ABOUT,
-        args=list(arguments),
-        config=(tyro.conf.OmitArgPrefixes, tyro.conf.ConsolidateSubcommandArgs)[1:],
+        args=arguments,
+        config=(tyro.conf.ConsolidateSubcommandArgs,),
     )
     try:
         return command.run()
