@@ -25,7 +25,7 @@ def lobe_at(zenith: float, azimuth: float, grid, *, level_db: float = -85.0) -> 
 def test_every_metric_is_perfect_on_identical_spectra(room):
     truth = room.spectra_at(room.receivers(3))
     weight = metrics.pixel_weight(truth.grid)
-    picture = metrics.window_picture(truth.power, WINDOW)
+    picture = WINDOW.encode(truth.power)
     zero = torch.zeros(3)
     assert torch.equal(metrics.psnr(picture, picture, weight), torch.full((3,), 100.0))
     torch.testing.assert_close(metrics.ssim(picture, picture, truth.grid), torch.ones(3))
@@ -42,7 +42,7 @@ def test_every_metric_is_bad_on_the_spectrum_of_another_place(room):
     truth = room.spectra_at(pose[torch.tensor([0])])
     wrong = replace(room.spectra_at(pose[torch.tensor([1])]), pose=truth.pose)
     weight = metrics.pixel_weight(truth.grid)
-    first, second = (metrics.window_picture(item.power, WINDOW) for item in (truth, wrong))
+    first, second = (WINDOW.encode(item.power) for item in (truth, wrong))
     assert metrics.psnr(first, second, weight) < 30
     assert metrics.ssim(first, second, truth.grid) < 0.9
     assert metrics.rmse_db(truth.power, wrong.power, WINDOW, weight) > 1
@@ -62,7 +62,7 @@ def test_a_gain_offset_is_an_offset_and_leaves_directions_alone(room):
     torch.testing.assert_close(metrics.path_gain_error(truth, louder), torch.full((2,), 3.0))
     torch.testing.assert_close(metrics.peak_error(truth, louder), torch.zeros(2), atol=1e-4, rtol=0)
     torch.testing.assert_close(metrics.delay_spread_error(truth, louder), torch.zeros(2), atol=1e-15, rtol=0)
-    first, second = (metrics.window_picture(item.power, wide) for item in (truth, louder))
+    first, second = (wide.encode(item.power) for item in (truth, louder))
     torch.testing.assert_close(metrics.psnr(first, second, weight), torch.full((2,), -20 * math.log10(3 / 200)))
 
 
@@ -79,8 +79,8 @@ def test_a_shifted_peak_is_seen_in_its_angle_across_the_seam_and_near_the_pole()
 
 def test_ssim_runs_on_over_the_seam():
     grid = equirect_grid(60, 30)
-    base = metrics.window_picture(lobe_at(1.5, 0.0, grid).power, WINDOW)
-    other = metrics.window_picture(lobe_at(1.5, 0.3, grid).power, WINDOW)
+    base = WINDOW.encode(lobe_at(1.5, 0.0, grid).power)
+    other = WINDOW.encode(lobe_at(1.5, 0.3, grid).power)
     turned = [picture.roll(30, -1) for picture in (base, other)]
     torch.testing.assert_close(metrics.ssim(base, other, grid), metrics.ssim(*turned, grid))
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from rf3dgs.core.errors import InputError
+from rf3dgs.core.files import write_whole
 from rf3dgs.evaluation import (
     PhotoPair,
     ReportInputs,
@@ -17,7 +18,7 @@ from rf3dgs.evaluation import (
 )
 from rf3dgs.evaluation.figures import footprint_of
 from rf3dgs.evaluation.panels import even_ticks
-from rf3dgs.evaluation.pictures import LEVEL_COLOURS, coloured, difference_picture, hues, write_whole
+from rf3dgs.evaluation.pictures import LEVEL_COLOURS, coloured, difference_picture, hues
 from rf3dgs.evaluation.scores import SCORES
 from rf3dgs.spectra.codec import DbWindow
 

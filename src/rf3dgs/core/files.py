@@ -41,6 +41,12 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
         _sync(path.parent)
 
 
+def write_whole(path: str | Path, content: bytes) -> None:
+    """Write `content` as the file `path`, at once or not at all; DataError as of `atomic_file`."""
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(content)
+
+
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Yield an empty temporary folder; when the block ends well it becomes `path`, else it is removed.

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 from rf3dgs.core.errors import DataError
-from rf3dgs.core.files import atomic_file
+from rf3dgs.core.files import write_whole
 
 MAX_JSON_BYTES = 64 * 2**20
 MAX_JSON_DEPTH = 64
@@ -48,8 +48,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def write_json(path: Path, value: dict[str, Any]) -> None:
     """Write an object as readable JSON, at once or not at all; NaN is refused."""
     text = json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False)
-    with atomic_file(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+    write_whole(path, (text + "\n").encode())
 
 
 def read_text(path: Path, *, limit: int = MAX_TEXT_BYTES) -> str:

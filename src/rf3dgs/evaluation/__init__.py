@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from rf3dgs.evaluation.baselines.lookup import InverseDistance as InverseDistance
     from rf3dgs.evaluation.baselines.lookup import NearestNeighbour as NearestNeighbour
     from rf3dgs.evaluation.lpips import Lpips as Lpips
-    from rf3dgs.evaluation.pictures import save_png as save_png
     from rf3dgs.evaluation.pictures import save_spectrum_figure as save_spectrum_figure
     from rf3dgs.evaluation.pictures import spectrum_picture as spectrum_picture
     from rf3dgs.evaluation.protocol import Predictor as Predictor
@@ -33,7 +32,6 @@ _MODULES = {
     "SpectrumExample": ".report",
     "write_report": ".report",
     "spectrum_picture": ".pictures",
-    "save_png": ".pictures",
     "save_spectrum_figure": ".pictures",
 }
 __all__ = [  # noqa: RUF022
@@ -49,7 +47,6 @@ __all__ = [  # noqa: RUF022
     "SpectrumExample",
     "write_report",
     "spectrum_picture",
-    "save_png",
     "save_spectrum_figure",
 ]
 __getattr__, __dir__ = lazy_names(__name__, _MODULES)

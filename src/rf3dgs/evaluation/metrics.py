@@ -33,11 +33,6 @@ def window_level(power: Tensor, window: DbWindow) -> Tensor:
     return db_from_power(power).clamp(window.floor_db, window.ceil_db)
 
 
-def window_picture(power: Tensor, window: DbWindow) -> Tensor:
-    """The window's picture in [0, 1] of linear power, same shape: `clip((dB - floor) / (ceil - floor), 0, 1)`."""
-    return window.encode(power)
-
-
 def psnr(truth: Tensor, prediction: Tensor, weight: Tensor) -> Tensor:
     """Peak signal-to-noise ratio `[*batch]` [dB] of pictures `[*batch, row, col]` in [0, 1]; 100 when they are equal.
 

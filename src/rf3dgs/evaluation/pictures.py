@@ -8,8 +8,7 @@ import torch
 
 from rf3dgs.core.angles import angles_of
 from rf3dgs.core.errors import InputError
-from rf3dgs.core.files import atomic_file
-from rf3dgs.evaluation.metrics import window_picture
+from rf3dgs.core.files import write_whole
 from rf3dgs.spectra.codec import DbWindow, window_of
 from rf3dgs.spectra.spectrum import Spectrum
 
@@ -45,7 +44,7 @@ def spectrum_picture(spectrum: Spectrum, window: DbWindow | None = None) -> np.n
     """
     _one(spectrum)
     window = window_of(spectrum) if window is None else window
-    return coloured(window_picture(spectrum.power, window).numpy())
+    return coloured(window.encode(spectrum.power).numpy())
 
 
 def difference_picture(truth: Spectrum, prediction: Spectrum, window: DbWindow, *, span_db: float = 20.0) -> np.ndarray:
@@ -53,8 +52,8 @@ def difference_picture(truth: Spectrum, prediction: Spectrum, window: DbWindow, 
 
     The colours end at plus and minus `span_db`.
     """
-    gap = window_picture(prediction.power, window) - window_picture(truth.power, window)
-    gap_db = gap.numpy() * (window.ceil_db - window.floor_db)
+    gap = window.encode(prediction.power) - window.encode(truth.power)
+    gap_db = gap.numpy() * window.span_db
     return coloured(0.5 + 0.5 * gap_db / span_db, DIFFERENCE_COLOURS)
 
 
@@ -95,11 +94,6 @@ def encoded(picture: np.ndarray, kind: str = "PNG") -> bytes:
     options = {"quality": 88} if kind == "JPEG" else {"optimize": True}
     Image.fromarray(np.ascontiguousarray(picture)).save(buffer, kind, **options)
     return buffer.getvalue()
-
-
-def save_png(path: str | Path, picture: np.ndarray) -> None:
-    """Write a uint8 `[row, col, 3]` picture as PNG, whole or not at all."""
-    write_whole(path, encoded(picture))
 
 
 def save_spectrum_figure(
@@ -146,12 +140,6 @@ def save_spectrum_figure(
     buffer = io.BytesIO()
     figure.save(buffer, format="png")
     write_whole(path, buffer.getvalue())
-
-
-def write_whole(path: str | Path, content: bytes) -> None:
-    """Write `content` whole or not at all; an older file stays until then. DataError when the disk refuses."""
-    with atomic_file(path) as temporary:
-        temporary.write_bytes(content)
 
 
 def _one(spectrum: Spectrum) -> None:

@@ -91,8 +91,8 @@ def score(
 ) -> dict[str, np.ndarray]:
     """All per-position values `[n]` of predictions at the truth's poses and grid; NaN where one does not apply."""
     weight = metrics.pixel_weight(truth.grid)
-    true_picture = metrics.window_picture(truth.power, window)
-    picture = metrics.window_picture(prediction.power, window)
+    true_picture = window.encode(truth.power)
+    picture = window.encode(prediction.power)
     peak = torch.rad2deg(metrics.peak_error(truth, prediction))
     nothing = torch.full_like(peak, math.nan)
     covariance = beams.panel_covariance(prediction, array)

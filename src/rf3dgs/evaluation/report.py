@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from rf3dgs.core.files import write_whole
 from rf3dgs.evaluation import page, provenance
 from rf3dgs.evaluation.figures import distributions, position_map
 from rf3dgs.evaluation.panels import colour_bar, data_address, even_ticks, panel
@@ -21,7 +22,6 @@ from rf3dgs.evaluation.pictures import (
     hues,
     photo_picture,
     spectrum_picture,
-    write_whole,
 )
 from rf3dgs.evaluation.results import results
 from rf3dgs.evaluation.table import FIELD, Evaluation

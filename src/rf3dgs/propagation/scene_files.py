@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 import numpy as np
 
 from rf3dgs.core.errors import DataError
-from rf3dgs.core.files import atomic_file
+from rf3dgs.core.files import atomic_file, write_whole
 from rf3dgs.propagation import meshes
 from rf3dgs.propagation.materials import permittivity
 from rf3dgs.propagation.scene import Scene, SceneObject
@@ -158,6 +158,5 @@ def _value(parent: ET.Element, kind: str, name: str, value: object) -> None:
 
 def _write_xml(root: ET.Element, path: Path) -> Path:
     ET.indent(root)
-    with atomic_file(path) as temporary:
-        temporary.write_bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True))
+    write_whole(path, ET.tostring(root, encoding="utf-8", xml_declaration=True))
     return path

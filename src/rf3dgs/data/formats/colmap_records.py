@@ -8,7 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from rf3dgs.core.errors import DataError
-from rf3dgs.core.files import atomic_file
+from rf3dgs.core.files import write_whole
 from rf3dgs.core.frames import quaternion_from_matrix
 from rf3dgs.data.safe import read_bytes, read_text
 
@@ -178,16 +178,16 @@ def write_binary(
     for camera in cameras.values():
         parts.append(struct.pack("<iiQQ", camera.number, _NUMBERS[camera.model], camera.width, camera.height))
         parts.append(struct.pack(f"<{len(camera.params)}d", *camera.params))
-    _write(folder / "cameras.bin", b"".join(parts))
+    write_whole(folder / "cameras.bin", b"".join(parts))
     parts = [struct.pack("<Q", len(images))]
     for image in images:
         parts.append(struct.pack("<i7di", image.number, *image.quaternion, *image.translation, image.camera))
         parts.append(image.name.encode() + b"\0" + struct.pack("<Q", 0))
-    _write(folder / "images.bin", b"".join(parts))
+    write_whole(folder / "images.bin", b"".join(parts))
     parts = [struct.pack("<Q", len(points.positions))]
     for number, (position, colour) in enumerate(zip(points.positions, points.colours, strict=True), start=1):
         parts.append(struct.pack("<Q3d3BdQ", number, *position.tolist(), *colour.tolist(), 0.0, 0))
-    _write(folder / "points3D.bin", b"".join(parts))
+    write_whole(folder / "points3D.bin", b"".join(parts))
 
 
 def write_text_model(
@@ -197,18 +197,18 @@ def write_text_model(
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     for camera in cameras.values():
         lines.append(" ".join(map(str, (camera.number, camera.model, camera.width, camera.height, *camera.params))))
-    _write(folder / "cameras.txt", "\n".join([*lines, ""]).encode())
+    write_whole(folder / "cameras.txt", "\n".join([*lines, ""]).encode())
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
     for image in images:
         lines.append(
             " ".join(map(str, (image.number, *image.quaternion, *image.translation, image.camera, image.name)))
         )
         lines.append("")
-    _write(folder / "images.txt", "\n".join([*lines, ""]).encode())
+    write_whole(folder / "images.txt", "\n".join([*lines, ""]).encode())
     lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
     for number, (position, colour) in enumerate(zip(points.positions, points.colours, strict=True), start=1):
         lines.append(" ".join(map(str, (number, *position.tolist(), *colour.tolist(), 0.0))))
-    _write(folder / "points3D.txt", "\n".join([*lines, ""]).encode())
+    write_whole(folder / "points3D.txt", "\n".join([*lines, ""]).encode())
 
 
 def _camera(number: int, model: str, width: int, height: int, params: tuple[float, ...], path: Path) -> CameraRecord:
@@ -238,8 +238,3 @@ def _integers(words: tuple[str, ...] | list[str], path: Path, line: str) -> tupl
 def _points(positions: list, colours: list) -> Points:
     paint = np.clip(np.array(colours, dtype=np.float64).reshape(-1, 3), 0, 255).astype(np.uint8)
     return Points(np.array(positions, dtype=np.float64).reshape(-1, 3), paint)
-
-
-def _write(path: Path, content: bytes) -> None:
-    with atomic_file(path) as temporary:
-        temporary.write_bytes(content)
