@@ -85,7 +85,7 @@ def make_dataset(
     again = replace(trace, seed=trace.seed + REPEAT_SEED, rays=round(trace.rays * REPEAT_RAYS))
     repeat = spectra_of_scene(scene, rx[index], grid, again, progress)
     meta = {
-        "generator": f"scene {scene.name}, depth {trace.depth}, {trace.passes} x {trace.rays} rays; {photos} photographs",
+        "generator": f"{scene.name}, depth {trace.depth}, {trace.passes} x {trace.rays} rays; {photos} photographs",
         "seed": seed,
         "repeat": {"rays": again.rays, "seed": again.seed},
     }
