@@ -198,6 +198,20 @@ def test_a_stopped_run_ends_like_a_calm_one(training, tmp_path):
         assert torch.equal(getattr(calm.surface, name), getattr(resumed.surface, name))
 
 
+def test_a_checkpoint_of_other_measurements_is_refused(training, tmp_path):
+    config = replace(QUICK, steps=2)
+    fit_radio(room(), training, config, checkpoint_dir=tmp_path)
+    turned = Pose.from_yaw(training.pose.position, torch.full((len(training),), 0.3))
+    for other in (
+        replace(training, delay=training.delay + 1e-9),
+        replace(training, pose=turned),
+        replace(training, frequency=61e9),
+        replace(training, instrument=Instrument.gaussian(0.3)),
+    ):
+        with pytest.raises(InputError, match=r"was made with another (data|frequency|instrument)"):
+            fit_radio(room(), other, config, checkpoint_dir=tmp_path)
+
+
 def test_frozen_geometry_stays_and_opacity_follows_only_when_asked(training):
     geometry = room()
     moved = fit_radio(geometry, training, QUICK)

@@ -80,11 +80,15 @@ def fit_radio(
         face_size=config.face_size,
     )
     stage = RadioStage(bare, views, config)
+    pose = spectra.pose
+    measured = (spectra.power, spectra.delay, spectra.aod, pose.position, pose.orientation, spectra.grid.directions)
     identity = {
         "stage": "radio",
         "config": asdict(config),
         "tx": where.position.tolist(),
-        "data": fingerprint([*geometry.tensors().values(), spectra.power, spectra.pose.position]),
+        "instrument": asdict(spectra.instrument),
+        "frequency": spectra.frequency,
+        "data": fingerprint([*geometry.tensors().values(), *(part for part in measured if part is not None)]),
     }
     train(
         stage,
@@ -95,7 +99,6 @@ def fit_radio(
         checkpoint_dir=checkpoint_dir,
         every_steps=config.checkpoint_every,
     )
-    position = spectra.pose.position
     meta = {
         "steps": config.steps,
         "seed": config.seed,
@@ -110,7 +113,7 @@ def fit_radio(
         frequency=spectra.frequency,
         instrument=spectra.instrument,
         tx=where,
-        bounds=torch.stack((position.amin(0), position.amax(0))),
+        bounds=torch.stack((pose.position.amin(0), pose.position.amax(0))),
         colour=_colour(geometry),
         meta=meta,
         backend=config.backend,
