@@ -131,6 +131,7 @@ def test_info_and_validate_of_the_shipped_dataset(capsys: pytest.CaptureFixture[
     text = capsys.readouterr().out
     assert "60 GHz" in text
     assert "photographs" in text
+    assert "(0.60, 0.80, 2.60) m, given" in text
     assert main(["validate", str(ASSETS / "lobby")]) == 0
     assert "good" in capsys.readouterr().out
 

@@ -71,19 +71,21 @@ def facts_of(path: Path) -> dict[str, str]:
 
 def _field_facts(path: str | Path) -> dict[str, str]:
     field = open_field(path)
+    meta = {name: str(value) for name, value in field.meta.items()}
+    how = f", {meta.pop('transmitter')}" if "transmitter" in meta else ""
     low, high = (", ".join(f"{value:.2f}" for value in corner) for corner in field.bounds.tolist())
     facts = {
         "kind": "radio radiance field",
         "Gaussians": f"{len(field.surface):,}",
         "point sources": str(len(field.sources)),
         "frequency": f"{field.frequency / 1e9:g} GHz",
-        "transmitter": "(" + ", ".join(f"{value:.2f}" for value in field.tx.position.tolist()) + ") m",
+        "transmitter": "(" + ", ".join(f"{value:.2f}" for value in field.tx.position.tolist()) + f") m{how}",
         "dB window": f"{field.window.floor_db:.1f} to {field.window.ceil_db:.1f} dB",
         "instrument": field.instrument.name,
         "encoding": field.surface.encoding,
         "trained between": f"({low}) and ({high}) m",
     }
-    return facts | {name: str(value) for name, value in field.meta.items()}
+    return facts | {name: value for name, value in meta.items() if name not in facts}
 
 
 def _dataset_facts(path: Path) -> dict[str, str]:
@@ -94,7 +96,7 @@ def _dataset_facts(path: Path) -> dict[str, str]:
         facts |= {
             "positions": ", ".join(f"{dataset.roles.count(role)} {role}" for role in dict.fromkeys(dataset.roles)),
             "grid": f"{grid.kind} {grid.width}x{grid.height}",
-            "frequency": f"{dataset.train.spectra.frequency / 1e9:g} GHz" if dataset.train.spectra else "",
+            "frequency": f"{dataset.frequency / 1e9:g} GHz",
             "transmitter": "unknown" if tx is None else str([round(value, 3) for value in tx.position.tolist()]),
         }
     return facts | {name: str(value) for name, value in dataset.meta.items()}

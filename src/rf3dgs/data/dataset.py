@@ -165,10 +165,6 @@ class Dataset:
             unseal_test=self.unseal_test if unseal_test is None else unseal_test,
         )
 
-    def with_photos(self, photos: Sequence[Photo], photo_roles: Sequence[str] = ()) -> "Dataset":
-        """The same spectra with other photos."""
-        return self._with(photos=tuple(photos), photo_roles=tuple(photo_roles))
-
     @property
     def train(self) -> Part:
         """What may be learned from."""
@@ -232,6 +228,11 @@ class Dataset:
     def grid(self) -> DirectionGrid:
         """The directions of every spectrum."""
         return self._any().grid
+
+    @property
+    def frequency(self) -> float:
+        """The carrier of every spectrum [Hz]."""
+        return self._any().frequency
 
     @property
     def tx(self) -> Pose | None:
