@@ -6,8 +6,8 @@ The pictures hold levels from 0 to 1 in 8 bits, grey or jet colours, without a u
 window that the user supplies; delay and departure are not in them.
 """
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -21,17 +21,10 @@ from rf3dgs.data.dataset import Dataset
 from rf3dgs.data.formats.colmap import read_colmap
 from rf3dgs.data.photo import PhotoSet
 from rf3dgs.data.safe import read_text
+from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 
 INDEX_FILES = {"train": "train_index.txt", "test": "test_index.txt"}
-
-
-class Window(Protocol):
-    """What a dB window must do: `decode` turns levels 0 ... 1 into linear power (spectra's `DbWindow`)."""
-
-    def decode(self, values: Tensor, /) -> Tensor:
-        """Linear power of levels 0 ... 1."""
-        ...
 
 
 def is_rf3dgs_v0(path: Path) -> bool:
@@ -53,14 +46,14 @@ def read_rf3dgs_v0_pictures(path: str | Path) -> PhotoSet:
     if missing:
         raise DataError(f"{path}: {len(missing)} pictures are in neither index file, such as {missing[0]!r}; add them")
     note = "uncalibrated: 8-bit levels from 0 to 1 without a unit"
-    photos = tuple(type(photo)(photo.name, photo.camera, photo.path, note=note) for photo in found.photos)
+    photos = tuple(replace(photo, note=note) for photo in found.photos)
     roles = tuple(role_of[Path(photo.name).stem] for photo in photos)
     return PhotoSet(photos, "rf3dgs_v0", found.points, found.colours, roles, (*found.notes, note))
 
 
 def read_rf3dgs_v0(
     path: str | Path,
-    window: Window | None = None,
+    window: DbWindow | None = None,
     *,
     frequency: float | None = None,
     instrument: Instrument | None = None,
