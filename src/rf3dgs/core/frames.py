@@ -123,7 +123,10 @@ class Pose:
 
     @classmethod
     def look_at(cls, position: Tensor | Sequence, target: Tensor | Sequence) -> "Pose":
-        """A pose at `position` whose forward axis points to `target`, with the left axis horizontal."""
+        """A pose at `position` `[*batch, 3]` whose forward axis points to `target` `[*batch, 3]` [m] and left is level.
+
+        Straight up and down the left axis is the world's y. InputError where both are the same point.
+        """
         position = torch.as_tensor(position, dtype=torch.float32)
         forward = torch.as_tensor(target, dtype=torch.float32) - position
         distance = torch.linalg.vector_norm(forward, dim=-1, keepdim=True)

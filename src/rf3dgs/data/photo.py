@@ -81,7 +81,10 @@ def photo_of_file(name: str, camera: Camera, path: Path, *, note: str = "") -> P
 
 
 def check_camera(viewmat: Tensor, K: Tensor, *, where: str) -> None:
-    """Refuse a camera that is not finite, not rigid or has no focal length, naming `where` it came from."""
+    """Refuse a camera that is not finite, not rigid or has no focal length: DataError naming `where` it came from.
+
+    `viewmat` `[4, 4]` is camera_from_world, `K` `[3, 3]` in pixels.
+    """
     if not bool(torch.isfinite(viewmat).all() and torch.isfinite(K).all()):
         raise DataError(f"{where}: the camera pose or intrinsics hold NaN or infinity; remove that picture")
     rotation = viewmat[:3, :3].double()

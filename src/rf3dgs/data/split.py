@@ -62,7 +62,10 @@ def split_positions(
 
 
 def check_roles(positions: Tensor, roles: Sequence[str]) -> None:
-    """Refuse unknown roles, other counts, and one place (positions closer than 1 mm) on two sides of the split."""
+    """Refuse unknown roles, other counts, and one place (closer than 1 mm) on two sides of the split.
+
+    `positions` `[n, 3]` [m] with one role each; InputError names the first two positions that are torn apart.
+    """
     if len(roles) != len(positions):
         raise InputError(f"expected one role per position, {len(positions)}; got {len(roles)} roles")
     unknown = sorted(set(roles) - set(ROLES))

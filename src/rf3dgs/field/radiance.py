@@ -65,10 +65,12 @@ class Surface:
 
     @property
     def scales(self) -> Tensor:
+        """Standard deviations `[N, 3]` [m]."""
         return self.log_scales.exp()
 
     @property
     def opacities(self) -> Tensor:
+        """Opacities `[N]` in 0..1."""
         return torch.sigmoid(self.logit_opacities)
 
     @classmethod
@@ -82,7 +84,10 @@ class Surface:
         degree: int = 3,
         delay_span: float = 1e-7,
     ) -> "Surface":
-        """The surface before any spectrum is seen: all harmonics zero, so that every Gaussian is at mid-window."""
+        """The surface before any spectrum is seen: all harmonics zero, so that every Gaussian is at mid-window.
+
+        `tx` `[3]` [m], `degree` of the gain's harmonics; the others as in the class.
+        """
         count = len(geometry)
         if encoding not in CSI_CHANNELS:
             raise InputError(f'encoding must be "vector" or "paper"; got {encoding!r}')
@@ -101,7 +106,7 @@ class Surface:
         )
 
     def select(self, index: Tensor) -> "Surface":
-        """The surface of some of the Gaussians; differentiable in the harmonics and opacities."""
+        """The surface of the Gaussians `index` `[n]`; differentiable in the harmonics and opacities."""
         names = ("means", "quats", "log_scales", "logit_opacities", "gain_sh", "csi_sh")
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
@@ -195,5 +200,5 @@ def decode(channels: Tensor, surface: Surface, receiver: Tensor) -> Radiance:
 
 
 def surface_power(value: Tensor, window: DbWindow) -> Tensor:
-    """Linear power of a composited gain in window units; zero at the floor and below, the ceiling at most."""
+    """Linear power `[*shape]` of composited gains in window units: zero at the floor and below, the ceiling at most."""
     return torch.where(value > 0, window.decode(value.clamp(0.0, 1.0)), torch.zeros_like(value))

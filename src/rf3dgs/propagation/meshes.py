@@ -90,7 +90,7 @@ def coloured(item: "SceneObject", longest_edge: float | None) -> tuple[Tensor, T
 
 
 def write_mesh(path: Path, vertices: Tensor, faces: Tensor, uv: Tensor | None) -> None:
-    """A binary little-endian PLY with x, y, z, and u, v when given."""
+    """Write a binary little-endian PLY: vertices `[V, 3]` [m], faces `[F, 3]`, and `uv` `[V, 2]` when given."""
     columns = vertices if uv is None else torch.cat((vertices, uv), -1)
     names = ("x", "y", "z", "u", "v")[: columns.shape[-1]]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]

@@ -141,7 +141,10 @@ def write_colmap(
     colours: Tensor | None = None,
     binary: bool = True,
 ) -> None:
-    """Write `path/sparse/0` with the cameras of photos under their names; pictures stay where they are."""
+    """Write `path/sparse/0` with the cameras of photos under their names; pictures stay where they are.
+
+    `points` `[n, 3]` and their `colours` `[n, 3]` in 0..1, mid-grey without them; `binary` or text files.
+    """
     folder = Path(path) / "sparse" / "0"
     numbers: dict[tuple, int] = {}
     cameras, images = {}, []

@@ -52,6 +52,7 @@ class ImageRecord:
 
     @classmethod
     def of_viewmat(cls, number: int, viewmat: Tensor, camera: int, name: str) -> "ImageRecord":
+        """The record of a pose `viewmat` `[4, 4]`, camera_from_world."""
         viewmat = viewmat.double()
         quaternion = tuple(quaternion_from_matrix(viewmat[:3, :3]).tolist())
         return cls(number, quaternion, tuple(viewmat[:3, 3].tolist()), camera, name)
@@ -75,6 +76,7 @@ class _Cursor:
         self.path, self.data, self.position = path, read_bytes(path), 0
 
     def take(self, layout: str) -> tuple:
+        """The next values of a `struct` layout, little endian."""
         size = struct.calcsize("<" + layout)
         self.need(size)
         values = struct.unpack_from("<" + layout, self.data, self.position)
@@ -82,10 +84,12 @@ class _Cursor:
         return values
 
     def need(self, size: int) -> None:
+        """DataError unless `size` bytes follow."""
         if size > len(self.data) - self.position:
             raise DataError(f"{self.path}: the file ends before its last record; it is truncated. Export it again")
 
     def skip(self, size: int) -> None:
+        """Pass over `size` bytes."""
         self.need(size)
         self.position += size
 
@@ -96,6 +100,7 @@ class _Cursor:
         return count
 
     def text(self) -> str:
+        """The next name, which ends with a zero byte."""
         end = self.data.find(b"\0", self.position)
         if end < 0:
             raise DataError(f"{self.path}: a name does not end; the file is truncated. Export it again")
