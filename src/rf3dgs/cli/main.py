@@ -15,6 +15,7 @@ from rf3dgs.cli.demo import Demo
 from rf3dgs.cli.fit import Fit, FitGeometry, FitRadio
 from rf3dgs.cli.judge import Eval
 from rf3dgs.cli.make import MakePhotos, MakeSpectra, Trace
+from rf3dgs.cli.show import complain, out
 from rf3dgs.core.errors import RfError
 
 name = tyro.conf.subcommand
@@ -44,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit status: 0 good, 1 found faults, 2 an error, 130 interrupted."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if arguments in (["--version"], ["version"]):
-        print(f"rf3dgs {__version__}")  # noqa: T201
+        out(f"rf3dgs {__version__}")
         return 0
     # torch's idle OpenMP threads spin for milliseconds after every operation; on a shared or small machine that costs
     # more than the work. The variable is read when torch is imported, which no line above does.
@@ -60,15 +61,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return command.run()
     except RfError as error:
-        print(f"rf3dgs: {error}", file=sys.stderr)  # noqa: T201
+        complain(str(error))
         return 2
     except KeyboardInterrupt:
-        print("rf3dgs: interrupted; a started training run resumes from its last checkpoint", file=sys.stderr)  # noqa: T201
+        complain("interrupted; a started training run resumes from its last checkpoint")
         return 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        print(f"rf3dgs: {where}{error.strerror or error}; check the name, its folder and free space", file=sys.stderr)  # noqa: T201
+        complain(f"{where}{error.strerror or error}; check the name, its folder and free space")
         return 2

@@ -20,6 +20,12 @@ def note(text: str) -> None:
     sys.stderr.flush()
 
 
+def complain(text: str) -> None:
+    """What went wrong, to standard error, in the program's name."""
+    sys.stderr.write(f"rf3dgs: {text}\n")
+    sys.stderr.flush()
+
+
 def console() -> Console:
     """Progress on standard error: a bar on a terminal, plain lines elsewhere."""
     return Console()
