@@ -95,5 +95,16 @@ def test_bad_grids_are_refused() -> None:
         pinhole_grid(10, 10)
     with pytest.raises(InputError, match="a camera needs a pinhole grid; got equirect"):
         Camera.of(Pose((0.0, 0.0, 0.0)), equirect_grid(8, 4))
+    with pytest.raises(InputError, match=r"a camera stands at one pose; got \[2\]"):
+        Camera.of(Pose(torch.zeros(2, 3)), pinhole_grid(4, 4, 90))
+    for K in (
+        torch.eye(2),
+        torch.diag(torch.tensor([float("nan"), 9.0, 1.0])),
+        torch.diag(torch.tensor([9.0, 0.0, 1.0])),
+    ):
+        with pytest.raises(InputError, match=r"K must be \[3, 3\], finite, with positive focal lengths"):
+            pinhole_grid(8, 6, K=K)
+    with pytest.raises(InputError, match=r"solid_angle must be \[2\], one per direction \[sr\]; got \[3\]"):
+        list_grid(torch.eye(3)[:2], torch.ones(3))
     with pytest.raises(InputError, match=r"directions must be \[direction, 3\]"):
         list_grid(torch.zeros(3))

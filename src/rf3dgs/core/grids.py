@@ -90,6 +90,8 @@ def pinhole_grid(width: int, height: int, fov_deg: float | None = None, *, K: Te
         K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     assert K is not None
     K = torch.as_tensor(K, dtype=torch.float32)
+    if K.shape != (3, 3) or not bool(torch.isfinite(K).all()) or not bool((K.diagonal() > 0).all()):
+        raise InputError(f"K must be [3, 3], finite, with positive focal lengths in pixels; got {K.tolist()}")
     edge_x = (torch.arange(width + 1, dtype=torch.float64) - K[0, 2].double()) / K[0, 0].double()
     edge_y = (torch.arange(height + 1, dtype=torch.float64) - K[1, 2].double()) / K[1, 1].double()
     corner = torch.atan2(edge_x * edge_y[:, None], torch.sqrt(1 + edge_x**2 + edge_y[:, None] ** 2))
@@ -114,11 +116,13 @@ def equirect_grid(width: int, height: int) -> DirectionGrid:
 
 
 def list_grid(directions: Tensor, solid_angle: Tensor | None = None) -> DirectionGrid:
-    """A list of directions `[n, 3]` in the device frame as a grid of one row."""
+    """A list of directions `[n, 3]` in the device frame as a grid of one row; `solid_angle` `[n]` [sr]."""
     directions = torch.nn.functional.normalize(torch.as_tensor(directions, dtype=torch.float32), dim=-1)
     if directions.dim() != 2 or directions.shape[-1] != 3:
         raise InputError(f"directions must be [direction, 3]; got {list(directions.shape)}")
-    weight = torch.zeros(len(directions)) if solid_angle is None else solid_angle
+    weight = torch.zeros(len(directions)) if solid_angle is None else torch.as_tensor(solid_angle, dtype=torch.float32)
+    if weight.shape != directions.shape[:1]:
+        raise InputError(f"solid_angle must be [{len(directions)}], one per direction [sr]; got {list(weight.shape)}")
     return DirectionGrid("list", directions[None], weight[None])
 
 
@@ -143,6 +147,8 @@ class Camera:
         """The camera that sees what a pinhole `grid` sees at one `pose`."""
         if grid.K is None:
             raise InputError(f"a camera needs a pinhole grid; got {grid.kind}. Render other grids through cube faces")
+        if pose.batch_shape:
+            raise InputError(f"a camera stands at one pose; got {list(pose.batch_shape)}. Choose one, as in pose[0]")
         return cls(pose.viewmat, grid.K, grid.width, grid.height)
 
     @property
