@@ -167,3 +167,11 @@ def test_photos_never_replace_a_folder_of_something_else(tmp_path, capsys):
     assert main(["photos", "lobby", "--out", str(folder)]) == 2
     assert "holds something else than a tour, such as diary.txt; choose another name" in capsys.readouterr().err
     assert (folder / "diary.txt").read_text() == "dear diary"
+
+
+def test_an_unknown_log_level_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("RF3DGS_LOG", "chatty")
+    assert main(["doctor"]) == 2
+    assert capsys.readouterr().err == "rf3dgs: RF3DGS_LOG must be DEBUG, INFO, WARNING or ERROR; got 'CHATTY'\n"

@@ -50,7 +50,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # torch's idle OpenMP threads spin for milliseconds after every operation; on a shared or small machine that costs
     # more than the work. The variable is read when torch is imported, which no line above does.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    logging.basicConfig(level=os.environ.get("RF3DGS_LOG", "WARNING").upper(), format="%(name)s: %(message)s")
+    level = os.environ.get("RF3DGS_LOG", "WARNING").upper()
+    if level not in logging.getLevelNamesMapping():
+        complain(f"RF3DGS_LOG must be DEBUG, INFO, WARNING or ERROR; got {level!r}")
+        return 2
+    logging.basicConfig(level=level, format="%(name)s: %(message)s")
     command = tyro.cli(
         Command,  # type: ignore[arg-type]
         prog="rf3dgs",
