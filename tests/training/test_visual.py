@@ -14,7 +14,7 @@ from rf3dgs.splats.image_loss import psnr
 from rf3dgs.training.adam import Adam
 from rf3dgs.training.config import VisualConfig
 from rf3dgs.training.initial import camera_box, random_start, upright, views_of
-from rf3dgs.training.photographs import blending_weights, depth_error, render_photo
+from rf3dgs.training.photographs import blending_weights, clamp_needles, depth_error, render_photo
 from rf3dgs.training.planes import directions_of, find_planes
 from rf3dgs.training.schedule import Schedule
 from rf3dgs.training.sweep import Surfaces, swept_surfaces
@@ -179,6 +179,12 @@ def test_flattened_gaussians_turn_their_shortest_axis_to_the_normal():
     directions = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     axes = matrix_from_quaternion(upright(directions))[:, :, 2]
     assert torch.allclose((axes * directions).sum(-1).abs(), torch.ones(50), atol=1e-5)
+
+
+def test_needles_are_shortened_and_discs_stay():
+    scales = torch.tensor([[0.9, 0.02, 0.01], [0.2, 0.2, 0.01]])
+    clamp_needles(logs := scales.log(), 0.5)
+    assert torch.allclose(logs.exp(), torch.tensor([[0.06, 0.02, 0.01], [0.2, 0.2, 0.01]]))
 
 
 def test_the_drawn_depth_is_compared_where_the_sweep_knows_it():

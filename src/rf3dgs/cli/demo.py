@@ -41,7 +41,9 @@ class Demo:
     """How paths are traced."""
     photo_config: PhotoConfig = field(default_factory=PhotoConfig)
     """How photographs are rendered."""
-    visual: VisualConfig = field(default_factory=lambda: VisualConfig(steps=3000, max_count=40_000))
+    visual: VisualConfig = field(
+        default_factory=lambda: VisualConfig(steps=3000, max_count=40_000, ssim_weight=0.05, degree=1)
+    )
     """The visual stage."""
     radio: RadioConfig = field(default_factory=RadioConfig)
     """The radio stage."""

@@ -1,5 +1,6 @@
 """Photographs as the visual stage sees them, and Gaussians as a camera sees them."""
 
+import math
 from collections.abc import Sequence
 from typing import Literal
 
@@ -13,6 +14,7 @@ from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import C0, basis, degree_of, view_directions
 from rf3dgs.splats.rasterize import rasterize
 
+LONGEST = 3.0
 BackendName = Literal["auto", "native", "reference", "gsplat"]
 
 
@@ -75,3 +77,9 @@ def depth_error(drawn: Tensor, known: Tensor) -> Tensor:
     counts = expected > 0
     relative = torch.where(counts, drawn / expected.clamp_min(1e-6) - 1, 0.0)
     return relative.abs().clamp_max(1.0).sum() / drawn.numel()
+
+
+def clamp_needles(log_scales: Tensor, largest: float) -> None:
+    """Bound scales in place: none above `largest` [m], the longest at most three times the middle one."""
+    log_scales.clamp_max_(math.log(largest))
+    torch.minimum(log_scales, log_scales.median(-1, keepdim=True).values + math.log(LONGEST), out=log_scales)

@@ -25,11 +25,12 @@ from rf3dgs.training.checkpoint import State, fingerprint
 from rf3dgs.training.config import VisualConfig
 from rf3dgs.training.initial import camera_box, random_start, swept_start
 from rf3dgs.training.loop import random_at, train, view_at
-from rf3dgs.training.photographs import blending_weights, colour_towards, depth_error, picture_of, shrunk
+from rf3dgs.training.photographs import blending_weights, clamp_needles, colour_towards, depth_error, picture_of, shrunk
 from rf3dgs.training.schedule import Schedule
 
 TRAINED = ("means", "quats", "log_scales", "logit_opacities", "level", "bands")
 HIGHER_BANDS_SLOWER = 20.0
+LARGEST_SURFACE = 0.05
 
 
 def fit_geometry(
@@ -155,6 +156,8 @@ class VisualStage:
         if offset.grad is not None:
             self.density.observe(offset.grad, raster.radii, camera.width, camera.height)
         self.adam.step(self._rates(iteration))
+        if self.depths and schedule.depth_weight > 0:
+            clamp_needles(self.parameters["log_scales"].data, LARGEST_SURFACE * self.extent)
         self._change_population(iteration)
         return float(loss.detach())
 
