@@ -73,8 +73,8 @@ def trace_each(
     scene = scene if isinstance(scene, Scene) else scene_of(scene)
     tx = scene.tx if tx is None else tx
     frequency = frequency or config.frequency or scene.frequency
-    numbers = range(len(rx)) if indices is None else indices
     _check(scene, tx, rx, config, frequency)
+    numbers = range(len(rx)) if indices is None else indices
     return _trace_each(scene, tx, rx, config, progress, frequency, list(numbers))
 
 
