@@ -25,12 +25,11 @@ from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.files import atomic_file
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.hdf5 import LIBVER, open_audited, read_array, read_attribute, write_text
-from rf3dgs.core.units import SPEED_OF_LIGHT
+from rf3dgs.core.units import LONGEST_DELAY, shortest_delay
 
 SCHEMA = "rf3dgs.paths"
 VERSION = 1
 CHUNK = 65_536
-MAX_DELAY = 1e-3  # [s] the way of light over 300 km
 FLOATS = ("coeff_real", "coeff_imag", "delay", "aoa_zenith", "aoa_azimuth", "aod_zenith", "aod_azimuth")
 INTEGERS = ("order", "kind")
 CONVENTIONS = {
@@ -265,7 +264,7 @@ class PathsReader:
                 )
         first, last = float(columns["delay"].min()), float(columns["delay"].max())
         distance = float(torch.linalg.vector_norm(self.rx[index].position - self.tx.position))
-        if last > MAX_DELAY or first * SPEED_OF_LIGHT < 0.9 * distance - 0.05:
+        if last > LONGEST_DELAY or first < shortest_delay(distance):
             raise DataError(
                 f"{self.path}: receiver {index}, {distance:.4g} m from the transmitter, has delays from {first:.3g} to "
                 f"{last:.3g} s, which light does not; positions must be in metres and delays in seconds, convert them"

@@ -4,12 +4,17 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from rf3dgs.cli.show import note, out
 from rf3dgs.core.errors import InputError
+
+if TYPE_CHECKING:
+    from rf3dgs.channel.paths import Paths
+    from rf3dgs.core.frames import Pose
+    from rf3dgs.field.radio_field import RadioField
 
 Format = Literal["text", "json", "csv", "mat"]
 
@@ -142,7 +147,7 @@ class View:
         return 0
 
 
-def path_columns(paths) -> dict[str, list[float]]:
+def path_columns(paths: "Paths") -> dict[str, list[float]]:
     """The valid paths of one receiver as columns in the units of their names."""
     from rf3dgs.core.units import db_from_power
 
@@ -179,7 +184,7 @@ def json_of(columns: dict[str, list[float]]) -> str:
 WRITERS = {"text": text_of, "csv": csv_of, "json": json_of}
 
 
-def warn_if_outside(field, pose) -> None:
+def warn_if_outside(field: "RadioField", pose: "Pose") -> None:
     """Say so when a receiver stands outside the volume the field was trained in."""
     if not bool(field.covers(pose)):
         note("this receiver stands outside the volume of the training positions; the answer extrapolates")

@@ -1,11 +1,15 @@
 """Units: SI without prefixes inside, dB only where a name says so."""
 
 import math
+from typing import TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact
+LONGEST_DELAY = 1e-3  # [s], the way of light over 300 km; what lies beyond is in another unit
+Distance = TypeVar("Distance", float, np.ndarray)
 
 
 def wavelength(frequency: float) -> float:
@@ -21,6 +25,11 @@ def db_from_power(power: Tensor, *, floor_db: float = -300.0) -> Tensor:
 def power_from_db(value_db: Tensor) -> Tensor:
     """Linear power of a level [dB], elementwise."""
     return torch.pow(10.0, value_db / 10.0)
+
+
+def shortest_delay(distance: Distance) -> Distance:
+    """The delay [s] below which no path over `distance` [m] is believed: light's, less 10 % and 5 cm; elementwise."""
+    return (0.9 * distance - 0.05) / SPEED_OF_LIGHT
 
 
 def friis_gain(distance: Tensor, frequency: float) -> Tensor:

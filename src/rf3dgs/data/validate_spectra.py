@@ -9,14 +9,13 @@ from scipy.spatial import KDTree
 
 from rf3dgs.core.errors import DataError
 from rf3dgs.core.hdf5 import open_audited, read_array, read_attribute
-from rf3dgs.core.units import SPEED_OF_LIGHT
+from rf3dgs.core.units import LONGEST_DELAY, shortest_delay
 from rf3dgs.data.formats.spectra_h5 import read_spectra
 
 Found = Iterator[tuple[str, str]]
 
 MAX_GAIN_DB = 30.0
 MAX_EXTENT = 1000.0  # [m] beyond it, positions without a delay that explains them are taken for millimetres
-MAX_DELAY = 1e-3  # [s] 300 km
 
 
 def spectra_faults(path: Path) -> Found:
@@ -130,7 +129,7 @@ def _scale_faults(group: h5py.Group, positions: np.ndarray, some: np.ndarray, na
     if "delay" in group:
         delay, known = _scaled(group, "delay")
         known = known & some
-        if known.any() and float(delay[known].max()) > MAX_DELAY:
+        if known.any() and float(delay[known].max()) > LONGEST_DELAY:
             yield f"{name}: delays reach {float(delay[known].max()):.3g} s, the way of light over 300 km", metres
             return
         if known.any() and float(delay[known].min()) < 0.0:
@@ -139,7 +138,7 @@ def _scale_faults(group: h5py.Group, positions: np.ndarray, some: np.ndarray, na
         first = np.where(known, delay, np.inf).reshape(len(delay), -1).min(1, initial=np.inf)
     if first is not None and "tx_position" in group:
         distance = np.linalg.norm(positions - read_array(group, "tx_position").reshape(-1, 3)[:1], axis=1)
-        early = np.flatnonzero(np.isfinite(first) & (first * SPEED_OF_LIGHT < 0.9 * distance - 0.05))
+        early = np.flatnonzero(np.isfinite(first) & (first < shortest_delay(distance)))
         if len(early):
             index = early[0]
             yield (

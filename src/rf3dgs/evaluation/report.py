@@ -23,6 +23,7 @@ from rf3dgs.evaluation.pictures import (
     photo_picture,
     spectrum_picture,
 )
+from rf3dgs.evaluation.protocol import Predictor
 from rf3dgs.evaluation.results import results
 from rf3dgs.evaluation.table import FIELD, Evaluation
 from rf3dgs.spectra.codec import DbWindow
@@ -50,7 +51,7 @@ class SpectrumExample:
     nearest: Spectrum | None = None
 
     @classmethod
-    def of(cls, label: str, predictor, truth: Spectrum, train: Spectrum | None = None) -> "SpectrumExample":
+    def of(cls, label: str, predictor: Predictor, truth: Spectrum, train: Spectrum | None = None) -> "SpectrumExample":
         """Render one position with `predictor` (and the copy from `train`); `truth` is the spectrum of one pose."""
         from rf3dgs.evaluation.baselines.lookup import NearestNeighbour
 
