@@ -175,3 +175,13 @@ def test_an_unknown_log_level_is_one_sentence(
     monkeypatch.setenv("RF3DGS_LOG", "chatty")
     assert main(["doctor"]) == 2
     assert capsys.readouterr().err == "rf3dgs: RF3DGS_LOG must be DEBUG, INFO, WARNING or ERROR; got 'CHATTY'\n"
+
+
+def test_the_shipped_field_is_scored_on_validation_positions(tmp_path, capsys) -> None:
+    report = tmp_path / "report.html"
+    assert main(["eval", "lobby", "lobby", "--out", str(report), "--json-out", str(tmp_path / "scores.json")]) == 0
+    table_of_scores = capsys.readouterr().out
+    assert "Hold-out: validation (8 positions)" in table_of_scores
+    assert "2nd solve" not in table_of_scores, "the validation positions were solved once"
+    assert set(json.loads((tmp_path / "scores.json").read_text())) == {"validation"}
+    assert "Hold-out: validation" in report.read_text()

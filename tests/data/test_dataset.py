@@ -299,3 +299,11 @@ def test_unsound_spectra_are_not_written(spectra, tmp_path):
 def test_a_folder_without_a_manifest_is_no_dataset(tmp_path):
     with pytest.raises(DataError, match=r"expected dataset\.json in it; this is no dataset, or saving .* interrupted"):
         Dataset.load(tmp_path)
+
+
+def test_a_part_that_was_solved_once_has_no_repeat(spectra):
+    roles = ("validation", *("train",) * 19)
+    split = Dataset((), spectra, repeat=spectra[torch.tensor([5])], repeat_index=[5], roles=roles)
+    assert split.validation.repeat is None
+    assert split.validation.repeat_index is None
+    assert split.train.repeat_index.tolist() == [4]

@@ -28,7 +28,8 @@ _log = logging.getLogger(__name__)
 class Part:
     """One side of a split: its photos, its spectra `[position]`, and what a second solve saw at some of them.
 
-    `index` holds the places of these spectra among the dataset's; `repeat[i]` repeats `spectra[repeat_index[i]]`.
+    `index` holds the places of these spectra among the dataset's; `repeat[i]` repeats `spectra[repeat_index[i]]`, and
+    both are None where nothing was solved twice.
     """
 
     role: str
@@ -280,5 +281,7 @@ class Dataset:
             return part
         rank = {int(place): order for order, place in enumerate(index)}
         chosen = [order for order, place in enumerate(self.repeat_index.tolist()) if place in rank]
+        if not chosen:
+            return part
         local = torch.tensor([rank[int(self.repeat_index[order])] for order in chosen], dtype=torch.int64)
         return replace(part, repeat=self._repeat[torch.tensor(chosen, dtype=torch.int64)], repeat_index=local)

@@ -123,7 +123,7 @@ def is_distinct(truth: Spectrum, *, lead_db: float = 1.0) -> Tensor:
         _, value = find_peaks(power, truth.grid, count=2, separation=truth.instrument.lobe)
         lead = math.inf if len(value) < 2 else float(db_from_power(value[0]) - db_from_power(value[1]))
         distinct.append(lead >= lead_db)
-    return torch.tensor(distinct).reshape(truth.pose.batch_shape)
+    return torch.tensor(distinct, dtype=torch.bool).reshape(truth.pose.batch_shape)
 
 
 def path_gain_error(truth: Spectrum, prediction: Spectrum) -> Tensor:

@@ -74,7 +74,7 @@ def evaluate(
             predicted.append(_checked(method.render(spectra.pose[index], spectra.grid), spectra[index], name))
             progress.update(number * len(spectra) + index + 1)
         values[name] = score(spectra, stack_spectra(predicted), truth_covariance, window, array, lpips)
-    if repeat is not None:
+    if repeat is not None and len(repeat):
         values[CEILING] = _ceiling(spectra, _with_axis(repeat), truth_covariance, window, array, lpips)
     progress.finish()
     position = spectra.pose.position.numpy().copy()
