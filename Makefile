@@ -23,9 +23,9 @@ export OMP_WAIT_POLICY ?= passive
 $(BIN)/python:
 	@PYTHON="$(PYTHON)" tools/system-packages.sh run
 	"$(PYTHON)" -m venv $(VENV)
-	$(PIP) install -q -U "pip>=25.1"
 
 $(VENV)/torch.stamp: constraints.txt | $(BIN)/python
+	$(PIP) install -q -U "pip>=25.1"
 	$(PIP) install -q -c constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) torch
 	@touch $@
 
@@ -35,7 +35,7 @@ $(VENV)/package.stamp: $(VENV)/torch.stamp $(SOURCES)
 
 $(VENV)/test.stamp: $(VENV)/package.stamp
 	@PYTHON="$(PYTHON)" tools/system-packages.sh test
-	$(PIP) install -q -c constraints.txt -e ".[trace,sfm,mesh]" --group test --group lint
+	$(PIP) install -q -c constraints.txt -e ".[trace,sfm]" --group test --group lint
 	@touch $@
 
 demo: $(VENV)/package.stamp

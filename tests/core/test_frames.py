@@ -1,7 +1,5 @@
 """Laws of poses and of the frame conversions."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
@@ -13,9 +11,7 @@ from rf3dgs.core.frames import (
     matrix_from_quaternion,
     opengl_from_viewmat,
     quaternion_from_matrix,
-    quaternion_from_yaw_pitch_roll,
     viewmat_from_opengl,
-    yaw_pitch_roll_from_quaternion,
 )
 
 
@@ -34,13 +30,6 @@ def test_half_turns_keep_their_axis() -> None:
     for axis in ([0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]):
         quaternion = torch.tensor(axis, dtype=torch.float64)
         torch.testing.assert_close(quaternion_from_matrix(matrix_from_quaternion(quaternion)).abs(), quaternion)
-
-
-def test_euler_angles_round_trip_and_mean_rotation_about_z_y_x() -> None:
-    quaternion = quaternion_from_yaw_pitch_roll(0.3, -0.4, 0.5)
-    assert yaw_pitch_roll_from_quaternion(quaternion) == pytest.approx((0.3, -0.4, 0.5), abs=1e-6)
-    forward = matrix_from_quaternion(quaternion_from_yaw_pitch_roll(math.pi / 2, 0.0, 0.0))[:, 0]
-    torch.testing.assert_close(forward, torch.tensor([0.0, 1.0, 0.0]), atol=1e-6, rtol=0)
 
 
 def test_look_at_points_forward_and_keeps_left_level() -> None:

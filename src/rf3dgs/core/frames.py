@@ -4,7 +4,6 @@ World: z up. Device (transmitter, receiver, array): x forward, y left, z up. Cam
 OpenGL camera: x right, y up, z backward. Matrices are named `target_from_source`; quaternions are unit `wxyz`.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -234,30 +233,6 @@ def opengl_from_viewmat(viewmat: Tensor) -> Tensor:
     top = torch.cat((rotation @ OPENGL_FROM_CAMERA, position), -1)
     bottom = torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
     return torch.cat((top, bottom), -2)
-
-
-def quaternion_from_yaw_pitch_roll(yaw: float, pitch: float, roll: float) -> Tensor:
-    """`wxyz` of Rz(yaw) Ry(pitch) Rx(roll) [rad], the Euler angles of Sionna's devices; for adapters only."""
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
-    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
-    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
-    return torch.tensor(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ]
-    )
-
-
-def yaw_pitch_roll_from_quaternion(orientation: Tensor) -> tuple[float, float, float]:
-    """Yaw, pitch, roll [rad] about z, y, x of one `wxyz` quaternion `[4]`; for adapters only."""
-    m = matrix_from_quaternion(orientation.double())
-    pitch = math.asin(max(-1.0, min(1.0, -float(m[2, 0]))))
-    if abs(float(m[2, 0])) < 1.0 - 1e-9:
-        return math.atan2(m[1, 0], m[0, 0]), pitch, math.atan2(m[2, 1], m[2, 2])
-    return math.atan2(-m[0, 1], m[1, 1]), pitch, 0.0
 
 
 def mitsuba_from_viewmat(viewmat: Tensor) -> Tensor:

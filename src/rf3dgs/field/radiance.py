@@ -20,7 +20,7 @@ from rf3dgs.core.grids import Camera
 from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.spectra.codec import DbWindow, PaperEncoding
 from rf3dgs.splats.gaussians import Gaussians
-from rf3dgs.splats.harmonics import basis, view_directions
+from rf3dgs.splats.harmonics import evaluate, view_directions
 from rf3dgs.splats.rasterize import Backend, rasterize
 
 NANOSECOND = 1e-9
@@ -135,8 +135,7 @@ def reach_of(scales: Tensor) -> Tensor:
 
 def gain_values(gain_sh: Tensor, directions: Tensor) -> Tensor:
     """Gain `[N, 1]` in window units that Gaussians with `gain_sh` `[N, K]` show along `[N, 3]`."""
-    degree = int(gain_sh.shape[1] ** 0.5) - 1
-    return ((basis(directions, degree) * gain_sh).sum(-1, keepdim=True) + 0.5).clamp_min(0.0)
+    return evaluate(gain_sh[..., None], directions, offset=0.5, clamp=True)
 
 
 def csi_prior(means: Tensor, tx: Tensor, centre: Tensor) -> Tensor:
@@ -150,10 +149,9 @@ def csi_prior(means: Tensor, tx: Tensor, centre: Tensor) -> Tensor:
 
 def csi_values(surface: Surface, centre: Tensor, directions: Tensor) -> Tensor:
     """CSI channels `[N, 4]` (vector) or `[N, 3]` (paper) of each Gaussian for a receiver at `centre`."""
-    learned = torch.einsum("nk,nkc->nc", basis(directions, CSI_DEGREE[surface.encoding]), surface.csi_sh)
     if surface.encoding == "paper":
-        return (learned + 0.5).clamp_min(0.0)
-    return csi_prior(surface.means, surface.tx, centre) + learned
+        return evaluate(surface.csi_sh, directions, offset=0.5, clamp=True)
+    return csi_prior(surface.means, surface.tx, centre) + evaluate(surface.csi_sh, directions)
 
 
 def picture_of(surface: Surface, camera: Camera, *, csi: bool = True, backend: Backend = "auto") -> Tensor:

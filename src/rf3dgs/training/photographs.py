@@ -11,7 +11,7 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import Camera
 from rf3dgs.data.photo import Photo
 from rf3dgs.splats.gaussians import Gaussians
-from rf3dgs.splats.harmonics import C0, basis, degree_of, view_directions
+from rf3dgs.splats.harmonics import view_values
 from rf3dgs.splats.rasterize import rasterize
 
 LONGEST = 3.0
@@ -42,12 +42,8 @@ def colour_towards(level: Tensor, bands: Tensor, means: Tensor, camera: Camera) 
     `level` `[gaussian, 1, 3]` is the constant harmonic, `bands` `[gaussian, k - 1, 3]` the others. The direction to a
     Gaussian counts as fixed: `means` get no gradient from here.
     """
-    colour = C0 * level[:, 0] + 0.5
-    if bands.shape[1]:
-        along = view_directions(means.detach(), camera.position)
-        bases = basis(along, degree_of(bands.shape[1] + 1))[:, 1:]
-        colour = colour + torch.einsum("gk,gkc->gc", bases, bands)
-    return colour.clamp_min(0.0)
+    sh = torch.cat((level, bands), 1)
+    return view_values(sh, means.detach(), camera.position, offset=0.5, clamp=True)
 
 
 def picture_of(photo: Photo) -> Tensor:
