@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 
 from benchmarks.speed.scenes import room, view
+from rf3dgs.core.files import write_whole
 from rf3dgs.splats.harmonics import basis, evaluate, view_directions
 from rf3dgs.splats.image_loss import l1_ssim, l1_ssim_reference
 from rf3dgs.splats.rasterize import pick_backend, rasterize
@@ -98,7 +99,7 @@ def main() -> int:
             )
     print(f"{'at least' if worst >= GOAL else 'NOT'} {GOAL:.0f} times faster than the reference: {worst:.0f}")
     if options.json is not None:
-        options.json.write_text(json.dumps(result, indent=2) + "\n")
+        write_whole(options.json, (json.dumps(result, indent=2) + "\n").encode())
     return 0 if worst >= GOAL else 1
 
 
