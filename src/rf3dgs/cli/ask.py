@@ -71,9 +71,9 @@ class Render:
                     orientation=pose.orientation.numpy(),
                 )
         else:
-            from rf3dgs.evaluation.pictures import save_spectrum_figure
+            from rf3dgs.evaluation.pictures import colour_range, save_spectrum_figure
 
-            save_spectrum_figure(spectrum, self.out, window=field.window)
+            save_spectrum_figure(spectrum, self.out, window=colour_range([spectrum]))
         peak = float(spectrum.gain_db.max())
         gain_db = 10 * math.log10(max(float(spectrum.path_gain), 1e-30))
         what = "path gain" if self.grid == "sphere" else "path gain in view"

@@ -1,6 +1,7 @@
 """Pictures of spectra: colours in NumPy, PNG and JPEG bytes, files written whole or not at all."""
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,18 @@ def hues(turn: np.ndarray) -> np.ndarray:
     """uint8 `[*shape, 3]` colours of a cyclic value `[*shape]` that comes round at every integer."""
     phase = 2.0 * np.pi * (turn[..., None] - np.array([0.0, 1.0, 2.0]) / 3.0)
     return (255.0 * (0.5 + 0.42 * np.cos(phase))).round().astype(np.uint8)
+
+
+def colour_range(spectra: Sequence[Spectrum]) -> DbWindow:
+    """Where colours show most: from the 3rd to the 99.7th percentile of the levels of all `spectra`, in whole dB.
+
+    Stronger directions are as bright as the end. A field's own window, made so that nothing is clipped, is wider.
+    """
+    levels = torch.cat([spectrum.gain_db[spectrum.power > 0] for spectrum in spectra]).numpy()
+    if levels.size == 0:
+        raise InputError("these spectra have no power at all; there is nothing to draw")
+    low, high = np.percentile(levels, (3.0, 99.7))
+    return DbWindow(float(np.floor(low)), float(max(np.ceil(high), np.floor(low) + 10.0)))
 
 
 def spectrum_picture(spectrum: Spectrum, window: DbWindow | None = None) -> np.ndarray:

@@ -14,6 +14,7 @@ from rf3dgs.evaluation.figures import distributions, position_map
 from rf3dgs.evaluation.panels import colour_bar, data_address, even_ticks, panel
 from rf3dgs.evaluation.pictures import (
     DIFFERENCE_COLOURS,
+    colour_range,
     coloured,
     delay_picture,
     departure_pictures,
@@ -134,7 +135,7 @@ def _spectra(inputs: ReportInputs) -> list[str]:
     window = inputs.window
     if window is None or not inputs.examples:
         return []
-    colours = _colour_range(inputs.examples) if inputs.colours is None else inputs.colours
+    colours = colour_range([example.truth for example in inputs.examples]) if inputs.colours is None else inputs.colours
     scales = _scales(colours)
     parts = [
         page.note(
@@ -164,13 +165,6 @@ def _scales(window: DbWindow) -> str:
     level = colour_bar(coloured(ramp), even_ticks(window.floor_db, window.ceil_db), "power [dB]")
     gap = colour_bar(coloured(ramp, DIFFERENCE_COLOURS), even_ticks(-SPAN_DB, SPAN_DB, count=4), "error [dB]")
     return f'<div class="scales">{level}{gap}</div>'
-
-
-def _colour_range(examples: Sequence[SpectrumExample]) -> DbWindow:
-    """From the 3rd to the 99.7th percentile of the true levels of all examples, in whole dB."""
-    levels = torch.cat([example.truth.gain_db[example.truth.power > 0] for example in examples]).numpy()
-    low, high = np.percentile(levels, (3.0, 99.7))
-    return DbWindow(float(np.floor(low)), float(max(np.ceil(high), np.floor(low) + 10.0)))
 
 
 def _strongest(spectrum: Spectrum) -> tuple[float, float]:

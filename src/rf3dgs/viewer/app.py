@@ -18,7 +18,7 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT, db_from_power
-from rf3dgs.evaluation.pictures import coloured, spectrum_picture
+from rf3dgs.evaluation.pictures import colour_range, coloured, spectrum_picture
 from rf3dgs.field.radio_field import RadioField
 
 HOST = "127.0.0.1"
@@ -45,6 +45,7 @@ class Viewer:
         self._server = viser.ViserServer(host=HOST, port=port, label="rf3dgs", verbose=False)
         self.url = f"http://{HOST}:{self._server.get_port()}"
         self.position = self._start()
+        self._colours = colour_range([field.render(Pose(self.position.tolist()), GRID, csi=False)])
         self.drawn = 0
         self._wanted = threading.Event()
         self._stopped = threading.Event()
@@ -81,17 +82,6 @@ class Viewer:
     def _build(self) -> None:
         field, scene, gui = self.field, self._server.scene, self._server.gui
         scene.set_up_direction("+z")
-        surface = field.surface
-        finite = torch.isfinite(surface.means).all(-1) & torch.isfinite(surface.log_scales).all(-1)
-        rotation = Pose(torch.zeros(3), surface.quats[finite]).world_from_device
-        stretched = rotation * surface.scales[finite][:, None, :]
-        scene.add_gaussian_splats(
-            "/site",
-            centers=surface.means[finite].numpy(),
-            covariances=(stretched @ stretched.mT).numpy(),
-            rgbs=field.colour[finite].float().numpy() / 255.0,
-            opacities=field.solidity[finite].reshape(-1, 1).numpy(),
-        )
         tx = tuple(field.tx.position.tolist())
         scene.add_icosphere("/transmitter", radius=0.12, color=(230, 60, 40), position=tx)
         scene.add_label("/transmitter/label", "transmitter")
@@ -101,20 +91,48 @@ class Viewer:
         scene.add_icosphere("/receiver/ball", radius=0.1, color=(40, 110, 230))
         self._handle.on_update(lambda _event: self.move(self._handle.position))
         low, high = field.bounds.tolist()
+        top = float(field.surface.means[:, 2].max())
+        self._cut = gui.add_slider(
+            "show below [m]",
+            min=round(low[2], 1),
+            max=round(max(top, high[2]) + 0.5, 1),
+            step=0.1,
+            initial_value=round(high[2] + 0.3, 1),
+        )
+        self._cut.on_update(lambda _event: self._show_site())
+        self._show_site()
         centre = self._start()
-        self._server.initial_camera.position = tuple(centre + np.array([-0.4, -0.4, 0.5]) * (high[0] - low[0]))
+        away = centre - np.array(tx)  # the first view is from above, towards the transmitter
+        self._server.initial_camera.position = tuple(
+            centre + 0.9 * np.array([away[0], away[1], 0.0]) + np.array([0.0, 0.0, 0.55 * (high[0] - low[0])])
+        )
         self._server.initial_camera.look_at = tuple(centre)
         gui.configure_theme(control_width="large", show_logo=False)
         gui.add_markdown(
             "**Drag the blue receiver.** The picture is the whole sphere around it: the left edge is azimuth 180°, "
-            f"the middle 0°, the top is up. Dark is {field.window.floor_db:.0f} dB, "
-            f"yellow {field.window.ceil_db:.0f} dB."
+            f"the middle 0°, the top is up. Dark is {self._colours.floor_db:.0f} dB or less, "
+            f"yellow {self._colours.ceil_db:.0f} dB or more."
         )
         blank = np.zeros((GRID.height, GRID.width, 3), dtype=np.uint8)
         self._picture = gui.add_image(blank, label="spectrum", format="png")
         self._strongest = gui.add_slider("paths", min=1, max=20, step=1, initial_value=8)
         self._strongest.on_update(lambda _event: self._wanted.set())
         self._text = gui.add_markdown("")
+
+    def _show_site(self) -> None:
+        """Draw the Gaussians below the cut, so that one looks into a room instead of at its ceiling."""
+        field, surface = self.field, self.field.surface
+        shown = torch.isfinite(surface.means).all(-1) & torch.isfinite(surface.log_scales).all(-1)
+        shown &= surface.means[:, 2] < float(self._cut.value)
+        rotation = Pose(torch.zeros(3), surface.quats[shown]).world_from_device
+        stretched = rotation * surface.scales[shown][:, None, :]
+        self._server.scene.add_gaussian_splats(
+            "/site",
+            centers=surface.means[shown].numpy(),
+            covariances=(stretched @ stretched.mT).numpy(),
+            rgbs=field.colour[shown].float().numpy() / 255.0,
+            opacities=field.solidity[shown].reshape(-1, 1).numpy(),
+        )
 
     def _follow(self) -> None:
         while True:
@@ -134,7 +152,7 @@ class Viewer:
         spectrum = self.field.render(pose, GRID, csi=False)
         paths = self.field.paths(pose, strongest=int(self._strongest.value))
         spent = time.perf_counter() - began
-        picture = spectrum_picture(spectrum, self.field.window)
+        picture = spectrum_picture(spectrum, self._colours)
         self._picture.image = np.repeat(np.repeat(picture, 2, 0), 2, 1)
         points, levels = rays(paths, pose)
         if len(points):
