@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, pinhole_grid
 from rf3dgs.propagation import shapes
@@ -108,3 +109,8 @@ def test_the_tour_stands_in_free_space_and_sees_walls_floor_and_ceiling(site):
     assert torch.histc(yaw, 8, -180, 180).min() >= 2
     again = camera_tour(site, 48, seed=0)
     assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(cameras, again, strict=True))
+
+
+def test_a_photograph_needs_light_paths(site):
+    with pytest.raises(InputError, match="samples and bounces must be at least 1; got 0 and 6"):
+        next(render_photos(site, [], PhotoConfig(samples=0)))

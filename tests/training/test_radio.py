@@ -241,3 +241,5 @@ def test_bad_spectra_are_refused_by_position(training):
         fit_radio(room(), training[0], QUICK)
     with pytest.raises(InputError, match="floor_db < ceil_db"):
         fit_radio(room(), training, replace(QUICK, floor_db=-10.0))
+    with pytest.raises(InputError, match=r"steps must be 0 .* or more; got -1"):
+        fit_radio(room(), training, replace(QUICK, steps=-1))

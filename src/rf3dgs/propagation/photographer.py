@@ -58,6 +58,8 @@ def render_photos(
     Works without LLVM too, three times slower. Raises MissingDependencyError without Mitsuba.
     """
     config = PhotoConfig() if config is None else config
+    if config.samples < 1 or config.bounces < 1:
+        raise InputError(f"samples and bounces must be at least 1; got {config.samples} and {config.bounces}")
     progress = Silent() if progress is None else progress
     if find_llvm().path is not None:
         prepare()

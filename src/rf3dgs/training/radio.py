@@ -45,6 +45,8 @@ def fit_radio(
     """
     config = RadioConfig() if config is None else config
     progress = Silent() if progress is None else progress
+    if config.steps < 0:
+        raise InputError(f"steps must be 0 (the closed-form start alone) or more; got {config.steps}")
     geometry.check()
     check_spectra(spectra)
     where = spectra.tx if tx is None else tx
