@@ -1,7 +1,5 @@
 """`python -m rf3dgs`."""
 
-import sys
+from rf3dgs.cli.main import entry
 
-from rf3dgs.cli.main import main
-
-sys.exit(main())
+entry()

@@ -1,5 +1,6 @@
 """`rf3dgs`: finds the command, runs it, and turns an error of ours into one sentence and an exit status."""
 
+import gc
 import logging
 import os
 import sys
@@ -77,3 +78,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         where = f"{error.filename}: " if error.filename else ""
         complain(f"{where}{error.strerror or error}; check the name, its folder and free space")
         return 2
+
+
+def entry() -> None:
+    """The process of the command line: `main`, started and ended without the second that Python would add.
+
+    Importing torch makes hundreds of thousands of objects, which the default thresholds would collect over and over;
+    taking them down again one by one saves nothing, because every file is written and closed when `main` returns.
+    """
+    gc.set_threshold(100_000, 20, 20)
+    try:
+        status = main()
+    except SystemExit as stop:  # tyro ends so after --help and after a wrong argument
+        status = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
