@@ -97,9 +97,11 @@ void harmonics(const float* sh, const float* directions, int bases, int channels
     for (int lane = 0; lane < lanes; ++lane) {
       const size_t at = start + lane;
       for (int channel = 0; channel < channels; ++channel) {
-        float sum = 0.0f;
-        for (int k = 0; k < bases; ++k) sum += basis[k][lane] * sh[(at * bases + k) * channels + channel];
-        out[at * channels + channel] = sum;
+        double sum = 0.0;  // sixteen terms may cancel
+        for (int k = 0; k < bases; ++k) {
+          sum += static_cast<double>(basis[k][lane]) * sh[(at * bases + k) * channels + channel];
+        }
+        out[at * channels + channel] = static_cast<float>(sum);
       }
     }
   }
