@@ -5,7 +5,9 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/unique_ptr.h>
 
+#include <algorithm>
 #include <cmath>
+#include <limits>
 #include <optional>
 #include <stdexcept>
 #include <thread>
@@ -39,6 +41,7 @@ auto* data_or_null(const std::optional<Array>& array) {
 View view_of(const In<4, 4>& viewmat, const In<3, 3>& camera, int width, int height) {
   require(width > 0 && height > 0, "a picture needs at least one pixel each way");
   View view{};
+  view.kind = Kind::pinhole;
   const float* m = viewmat.data();
   const float* k = camera.data();
   for (int row = 0; row < 3; ++row) {
@@ -58,60 +61,89 @@ View view_of(const In<4, 4>& viewmat, const In<3, 3>& camera, int width, int hei
   return view;
 }
 
-Parameters parameters_of(const In<-1, 3>& means, const In<-1, 4>& quats, const In<-1, 3>& scales, const In<-1>& opacities,
-                         const In<-1, -1>& values, const std::optional<In<-1, 2>>& offset) {
+Geometry geometry_of(const In<-1, 3>& means, const In<-1, 4>& quats, const In<-1, 3>& scales, const In<-1>& opacities,
+                     const std::optional<In<-1, 2>>& offset) {
   const size_t count = means.shape(0);
   require(quats.shape(0) == count && scales.shape(0) == count && opacities.shape(0) == count &&
-              values.shape(0) == count && (!offset || offset->shape(0) == count),
+              (!offset || offset->shape(0) == count),
           "all arrays need one row per Gaussian");
   require(count < (size_t{1} << 31), "too many Gaussians");
-  require(values.shape(1) > 0, "values need at least one channel");
-  return {means.data(),     quats.data(),  scales.data(), opacities.data(), data_or_null(offset),
-          values.data(), static_cast<int>(values.shape(1))};
+  return {means.data(), quats.data(), scales.data(), opacities.data(), data_or_null(offset)};
 }
 
 std::unique_ptr<Scene> forward(In<-1, 3> means, In<-1, 4> quats, In<-1, 3> scales, In<-1> opacities, In<-1, -1> values,
                                In<4, 4> viewmat, In<3, 3> camera, std::optional<In<-1>> background,
-                               std::optional<In<-1, 2>> offset, Out<-1, -1, -1> picture, Out<-1, -1> weight,
-                               Out<-1> radii, int threads) {
-  const Parameters in = parameters_of(means, quats, scales, opacities, values, offset);
+                               std::optional<In<-1, 2>> offset, std::optional<float> gate, Out<-1, -1, -1> picture,
+                               Out<-1, -1> weight, Out<-1> radii, std::optional<Out<-1>> max_weight, int threads) {
+  const Geometry geometry = geometry_of(means, quats, scales, opacities, offset);
+  const size_t count = means.shape(0), channels = values.shape(1);
   const size_t height = picture.shape(0), width = picture.shape(1);
-  require(picture.shape(2) == values.shape(1) && weight.shape(0) == height && weight.shape(1) == width &&
-              radii.shape(0) == means.shape(0) && (!background || background->shape(0) == values.shape(1)),
+  require(values.shape(0) == count && channels > 0, "values need one row per Gaussian and at least one channel");
+  require(picture.shape(2) == channels && weight.shape(0) == height && weight.shape(1) == width &&
+              radii.shape(0) == count && (!background || background->shape(0) == channels) &&
+              (!max_weight || max_weight->shape(0) == count),
           "outputs do not fit the inputs");
+  require(!gate || *gate >= 0.0f, "the gate is a distance");
   const View view = view_of(viewmat, camera, static_cast<int>(width), static_cast<int>(height));
+  const float* const all_values = values.data();
+  const auto values_of = [=](size_t begin, size_t end, const uint32_t* sources, float* to) {
+    for (size_t at = 0; at < end - begin; ++at) {
+      std::copy_n(all_values + sources[at] * channels, channels, to + at * channels);
+    }
+  };
   nb::gil_scoped_release released;
-  return rasterize(view, means.shape(0), in, data_or_null(background), threads, picture.data(), weight.data(),
-                   radii.data());
+  return rasterize(view, count, geometry, static_cast<int>(channels), values_of, data_or_null(background),
+                   gate.value_or(std::numeric_limits<float>::infinity()), threads, picture.data(), weight.data(),
+                   radii.data(), data_or_null(max_weight));
 }
 
-void backward(const Scene& scene, In<-1, 3> means, In<-1, 4> quats, In<-1, 3> scales, In<-1> opacities,
-              In<-1, -1> values, std::optional<In<-1, 2>> offset, In<-1, -1, -1> picture, In<-1, -1> weight,
+template <int Columns>
+void scatter(const float* rows, const uint32_t* sources, size_t count, float* to) {
+  for (size_t at = 0; at < count; ++at) {
+    std::copy_n(rows + at * Columns, Columns, to + static_cast<size_t>(sources[at]) * Columns);
+  }
+}
+
+void backward(Scene& scene, In<-1, 3> means, In<-1, 4> quats, In<-1, 3> scales, In<-1> opacities,
+              std::optional<In<-1, 2>> offset, In<-1, -1, -1> picture, In<-1, -1> weight,
               In<-1, -1, -1> picture_gradient, std::optional<In<-1, -1>> weight_gradient,
               std::optional<Out<-1, -1>> values_gradient, std::optional<Out<-1>> opacities_gradient,
               std::optional<Out<-1, 3>> means_gradient, std::optional<Out<-1, 4>> quats_gradient,
               std::optional<Out<-1, 3>> scales_gradient, std::optional<Out<-1, 2>> offset_gradient, int threads) {
-  const Parameters in = parameters_of(means, quats, scales, opacities, values, offset);
+  const Geometry geometry = geometry_of(means, quats, scales, opacities, offset);
   const size_t height = scene.view.height, width = scene.view.width, channels = scene.channels;
   const auto is_picture = [&](const In<-1, -1, -1>& array) {
     return array.shape(0) == height && array.shape(1) == width && array.shape(2) == channels;
   };
   const auto is_map = [&](const In<-1, -1>& array) { return array.shape(0) == height && array.shape(1) == width; };
   const auto fits = [&](const auto& array) { return !array || array->shape(0) == scene.gaussians; };
-  require(means.shape(0) == scene.gaussians && values.shape(1) == channels && is_picture(picture) &&
-              is_picture(picture_gradient) && is_map(weight) && (!weight_gradient || is_map(*weight_gradient)) &&
-              fits(values_gradient) && (!values_gradient || values_gradient->shape(1) == channels) &&
-              fits(opacities_gradient) && fits(means_gradient) && fits(quats_gradient) && fits(scales_gradient) &&
-              fits(offset_gradient),
+  require(means.shape(0) == scene.gaussians && is_picture(picture) && is_picture(picture_gradient) &&
+              is_map(weight) && (!weight_gradient || is_map(*weight_gradient)) && fits(values_gradient) &&
+              (!values_gradient || values_gradient->shape(1) == channels) && fits(opacities_gradient) &&
+              fits(means_gradient) && fits(quats_gradient) && fits(scales_gradient) && fits(offset_gradient),
           "gradients do not fit the scene");
-  require(means_gradient.has_value() == quats_gradient.has_value() &&
-              means_gradient.has_value() == scales_gradient.has_value(),
-          "gradients of means, quats and scales come together");
-  const Gradients out = {data_or_null(values_gradient), data_or_null(opacities_gradient), data_or_null(means_gradient),
-                         data_or_null(quats_gradient),  data_or_null(scales_gradient),    data_or_null(offset_gradient)};
+  float* const to_values = data_or_null(values_gradient);
+  float* const to_opacities = data_or_null(opacities_gradient);
+  float* const to_means = data_or_null(means_gradient);
+  float* const to_quats = data_or_null(quats_gradient);
+  float* const to_scales = data_or_null(scales_gradient);
+  float* const to_offset = data_or_null(offset_gradient);
+  const bool any = to_means != nullptr || to_quats != nullptr || to_scales != nullptr || to_offset != nullptr;
+  const auto take = [=](size_t begin, size_t end, const uint32_t* sources, const float* values, const float* opacity,
+                        const GeometryRows* rows) {
+    const size_t count = end - begin;
+    for (size_t at = 0; at < count && to_values != nullptr; ++at) {
+      std::copy_n(values + at * channels, channels, to_values + sources[at] * channels);
+    }
+    if (to_opacities != nullptr) scatter<1>(opacity, sources, count, to_opacities);
+    if (to_means != nullptr) scatter<3>(rows->means, sources, count, to_means);
+    if (to_quats != nullptr) scatter<4>(rows->quats, sources, count, to_quats);
+    if (to_scales != nullptr) scatter<3>(rows->scales, sources, count, to_scales);
+    if (to_offset != nullptr) scatter<2>(rows->offset, sources, count, to_offset);
+  };
   nb::gil_scoped_release released;
-  rasterize_backward(scene, in, picture.data(), weight.data(), picture_gradient.data(), data_or_null(weight_gradient),
-                     threads, out);
+  rasterize_backward(scene, geometry, picture.data(), weight.data(), picture_gradient.data(),
+                     data_or_null(weight_gradient), any ? Which::everything : Which::appearance, threads, take);
 }
 
 constexpr size_t kHarmonicsChunk = 4096;
@@ -192,18 +224,19 @@ NB_MODULE(_native, m) {
       "The rasterizer's numbers by the names of splats/constants.py.");
 
   nb::class_<Scene>(m, "Scene", "What the backward pass needs of a forward pass.")
-      .def_prop_ro("visible", [](const Scene& scene) { return scene.splats.size(); })
-      .def_prop_ro("entries", [](const Scene& scene) { return scene.entries.size(); });
+      .def_prop_ro("visible", [](const Scene& scene) { return scene.visible; })
+      .def_prop_ro("entries", [](const Scene& scene) { return scene.entries; })
+      .def_prop_ro("pairs", [](const Scene& scene) { return scene.pairs; });
 
   m.def("rasterize", &forward, nb::arg("means").noconvert(), nb::arg("quats").noconvert(),
         nb::arg("scales").noconvert(), nb::arg("opacities").noconvert(), nb::arg("values").noconvert(),
         nb::arg("viewmat").noconvert(), nb::arg("camera").noconvert(), nb::arg("background").noconvert().none(),
-        nb::arg("offset").noconvert().none(), nb::arg("picture").noconvert(), nb::arg("weight").noconvert(),
-        nb::arg("radii").noconvert(), nb::arg("threads"));
+        nb::arg("offset").noconvert().none(), nb::arg("gate").none(), nb::arg("picture").noconvert(),
+        nb::arg("weight").noconvert(), nb::arg("radii").noconvert(), nb::arg("max_weight").noconvert().none(),
+        nb::arg("threads"));
   m.def("rasterize_backward", &backward, nb::arg("scene"), nb::arg("means").noconvert(), nb::arg("quats").noconvert(),
-        nb::arg("scales").noconvert(), nb::arg("opacities").noconvert(), nb::arg("values").noconvert(),
-        nb::arg("offset").noconvert().none(), nb::arg("picture").noconvert(), nb::arg("weight").noconvert(),
-        nb::arg("picture_gradient").noconvert(), nb::arg("weight_gradient").noconvert().none(),
+        nb::arg("scales").noconvert(), nb::arg("opacities").noconvert(), nb::arg("offset").noconvert().none(),
+        nb::arg("picture").noconvert(), nb::arg("weight").noconvert(), nb::arg("picture_gradient").noconvert(), nb::arg("weight_gradient").noconvert().none(),
         nb::arg("values_gradient").noconvert().none(), nb::arg("opacities_gradient").noconvert().none(),
         nb::arg("means_gradient").noconvert().none(), nb::arg("quats_gradient").noconvert().none(),
         nb::arg("scales_gradient").noconvert().none(), nb::arg("offset_gradient").noconvert().none(),

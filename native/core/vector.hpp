@@ -230,6 +230,14 @@ RF_INLINE float sum_of(Vec value) {
   return (four[0] + four[2]) + (four[1] + four[3]);
 }
 
+RF_INLINE float largest_of(const Vec& value) {
+  alignas(64) float lanes[kLanes];
+  store(lanes, value);
+  float largest = lanes[0];
+  for (int lane = 1; lane < kLanes; ++lane) largest = lanes[lane] > largest ? lanes[lane] : largest;
+  return largest;
+}
+
 // The sums of all lanes of N vectors, four at a time.
 template <int N>
 RF_INLINE void sums_of(const Vec* value, float* out) {
@@ -257,9 +265,9 @@ RF_INLINE void sums_of(const Vec* value, float* out) {
   for (; done < N; ++done) out[done] = sum_of(value[done]);
 }
 
-// e^x for x <= 0 with a relative error near 2e-7; zero below -87.
-RF_INLINE Vec exp_vec(Vec x) {
-  const Vec scaled = max_vec(x, splat_vec(-87.0f)) * 1.44269504088896341f;
+// 2^x for x <= 1 with a relative error near 2e-7; 2^-125 below that.
+RF_INLINE Vec exp2_vec(Vec x) {
+  const Vec scaled = max_vec(x, splat_vec(-125.0f));
   const Vec magic = splat_vec(12582912.0f);  // 1.5 * 2^23: adding it rounds to an integer
   const Vec shifted = scaled + magic;
   const Vec fraction = scaled - (shifted - magic);

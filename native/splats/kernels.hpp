@@ -10,79 +10,121 @@
 
 namespace rf3dgs {
 
-// A pinhole camera: camera_from_world (row-major rotation, translation), focal lengths and centre in pixels.
+enum class Kind { pinhole, sphere };
+constexpr int kKinds = 2;
+
+// camera_from_world (row-major rotation, translation) and the picture's size; for a pinhole also focal lengths and
+// centre in pixels and the limits of x/z and y/z in the Jacobian.
 struct View {
+  Kind kind;
   float rotation[9];
   float translation[3];
-  float fx, fy, cx, cy;
   int width, height;
-  float u_low, u_high, v_low, v_high;  // limits of x/z and y/z in the Jacobian
+  float fx, fy, cx, cy;
+  float u_low, u_high, v_low, v_high;
 };
 
-// A Gaussian on the screen: centre, inverse covariance (a, b; b, c), opacity, and the value of d^T conic d where its
-// alpha falls to the cut.
-struct Splat {
-  float x, y, a, b, c, opacity, cut;
-  uint32_t source;  // index among the caller's Gaussians
+// Activated Gaussians, as the caller keeps them.
+struct Geometry {
+  const float* means;
+  const float* quats;
+  const float* scales;
+  const float* opacities;
+  const float* offset;  // [gaussian, 2] added to the projected centres [pixel]; may be null
 };
 
-// What binning needs to know: half the size of the box around a splat [pixel] and its view depth [m].
+// The pixels a splat may reach: from left to right and top to bottom; none where right < left. On the sphere columns
+// count round and round.
 struct Extent {
-  float x, y, depth;
+  float left, top, right, bottom;
 };
+constexpr Extent kNowhere = {1.0f, 1.0f, -1.0f, -1.0f};
 
-// The first and last tiles of a box.
-struct TileBox {
-  int first_x, first_y, last_x, last_y;
+// Where a projection puts the visible ones of its Gaussians, one after the other. `radii` has a place for every Gaussian.
+struct Projected {
+  float* splats;  // of the view's kind
+  uint32_t* sources;
+  Extent* extents;
+  float* radii;
 };
 
 // A tile that a splat reaches, with the bits of its 4x4 pixel blocks.
 struct Found {
   uint32_t tile, splat, blocks;
+  float depth;
 };
 
-// A splat in a tile's list with the bits of those 4x4 pixel blocks it reaches.
+// A splat in a tile's list. Entries are numbered (`slot`) splat by splat, and within a splat tile by tile, which is where
+// their gradients go.
 struct Entry {
-  uint32_t splat;
-  uint32_t blocks;
+  float depth;
+  uint32_t splat, slot, blocks;
 };
 
-struct Parameters {
-  const float* means;
-  const float* quats;
-  const float* scales;
-  const float* opacities;
-  const float* offset;  // added to the projected centres [pixel]; may be null
-  const float* values;  // [gaussian, channels]; a Gaussian whose values are not finite is not drawn
-  int channels;
-};
-
-// Gradients with respect to one splat on the screen.
-struct SplatGradient {
-  float x, y, a, b, c, opacity;
-};
-
-struct GeometryGradients {
+// Rows of gradients of visible splats: of the activated parameters for a pinhole; on the sphere of what the splat is
+// drawn with: f1, f2, m.
+struct GeometryRows {
   float* means;
   float* quats;
   float* scales;
+  float* offset;
+  float* sphere;  // [., 9]
 };
 
-// Floats of an entry's row of gradients.
-constexpr int gradient_row(int chunk, bool geometry) { return chunk + (geometry ? 6 : 1); }
-
-// One tile's share of a picture. `values` is [splat, channels] in the order of the splats.
+// One tile's share of a picture. Splats and values [splat, channels] are in the order of the Gaussians.
 struct Tile {
+  const View* view;
   int x, y;  // first pixel
   const Entry* entries;
   size_t count;
-  const Splat* splats;
+  const float* splats;  // of the view's kind
   const float* values;
-  int channels;       // of values and pictures
-  int first, chunk;   // the channels this pass blends
-  int width, height;  // of the picture
-  const float* background;  // [channels] or null
+  int channels;      // of values and pictures
+  int first, chunk;  // the channels this pass blends
+  float gate;        // how far behind the depth of half transmittance Gaussians count [m]; may be infinite
 };
+
+// What forward blending writes: pictures, and the largest weight of each slot where it is asked for.
+struct Blended {
+  float* picture;
+  float* weight;
+  const float* background;  // [channels] or null
+  float* peaks;             // [slot] or null
+};
+
+// What backward blending reads, and the rows [slot, gradient_row] it writes.
+struct Slopes {
+  const float* picture;
+  const float* weight;
+  const float* picture_gradient;
+  const float* weight_gradient;  // or null
+  bool geometry;
+  float* rows;
+};
+
+// Floats of an entry's row of gradients: of a chunk of values, of ln alpha, and geometry sums.
+constexpr int gradient_row(int chunk, int geometry_sums) { return chunk + 1 + geometry_sums; }
+
+// What depends on the kind of view. A shape (kernels_pinhole.hpp, kernels_sphere.hpp) supplies these.
+struct ShapeKernels {
+  int splat_floats;   // size of a splat
+  int geometry_sums;  // that backward blending adds up for a splat
+  // Projects Gaussians [begin, end) and returns how many are visible.
+  size_t (*project)(const View&, const Geometry&, size_t begin, size_t end, const Projected&);
+  // From the geometry sums [count, geometry_sums] of splats to rows of gradients.
+  void (*project_backward)(const View&, const Geometry&, const uint32_t* sources, const float* sums, size_t count,
+                           const GeometryRows&);
+  // Writes the tiles that up to kReachGroup splats reach, splat by splat and row by row, and returns their number; `out`
+  // has room for all tiles of each. `number` is what the first of them is called, `reached` receives each one's tiles.
+  size_t (*tiles_reached)(const View&, const float* splats, const Extent*, int count, uint32_t number, uint32_t* reached,
+                          Found* out);
+  void (*blend)(const Tile&, const Blended&);
+  // A row of gradients for every entry: of the values of the chunk, the sum of d loss / d ln alpha and, when asked for,
+  // the geometry sums.
+  void (*blend_backward)(const Tile&, const Slopes&);
+};
+
+constexpr int kReachGroup = 16;
 
 // Two pictures [row, col, channel] to be compared, with an optional weight [row, col].
 struct PicturePair {
@@ -106,18 +148,7 @@ constexpr int loss_line(int width, int channels) {
 
 struct Kernels {
   const char* name;
-  // Projects Gaussians [begin, end); returns how many are visible and appends them to splats/extents.
-  size_t (*project)(const View&, const Parameters&, size_t begin, size_t end, Splat*, Extent*, float* radii);
-  // From gradients on the screen of splats [begin, end) to gradients of the parameters.
-  void (*project_backward)(const View&, const Parameters&, const Splat*, const SplatGradient*, size_t begin, size_t end,
-                           const GeometryGradients&);
-  // Writes the tiles of a box that a splat reaches, row by row, and returns their number; `out` has room for all.
-  size_t (*tiles_reached)(const Splat&, uint32_t index, const TileBox&, int tiles_x, Found* out);
-  void (*blend)(const Tile&, float* picture, float* weight);
-  // Writes a row of gradients for every entry: of the values of the chunk, of opacity and, when geometry is asked for,
-  // of x, y, a, b, c.
-  void (*blend_backward)(const Tile&, const float* picture, const float* weight, const float* picture_gradient,
-                         const float* weight_gradient, bool geometry, float* rows);
+  ShapeKernels shape[kKinds];
   void (*harmonics)(const float* sh, const float* directions, int bases, int channels, size_t begin, size_t end,
                     float* out);
   void (*harmonics_backward)(const float* gradient, const float* directions, int bases, int channels, size_t begin,

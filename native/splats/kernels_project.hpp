@@ -14,6 +14,11 @@ namespace {
 
 using namespace rf3dgs;
 
+// A Gaussian on the screen: log2 of its alpha at d = pixel - (x, y) is peak - (p dx + r dy)^2 - (s dy)^2.
+struct PinholeSplat {
+  float x, y, p, r, s, peak, depth, unused;
+};
+
 struct Projection {
   Vec x, y, z;           // in the camera
   Vec qw, qx, qy, qz;    // unit quaternion
@@ -35,30 +40,23 @@ RF_INLINE Vec gather(const float* from, const size_t* index, int stride, int col
   return load(lanes);
 }
 
-// 2 ln(opacity / cut), where alpha falls to the cut, for opacities from the cut to one. With x = 2^e m and m between
-// sqrt(1/2) and sqrt(2), ln m = 2 artanh s, s = (m - 1) / (m + 1).
-RF_INLINE Vec reach_of(Vec opacity) {
+constexpr float kHalfLog2E = 0.5f * 1.442695040888963f;
+constexpr float kLog2AlphaMin = -7.994353436858858f;
+
+// log2(opacity / cut), how far alpha may fall before it reaches the cut, for opacities from the cut to one. With
+// x = 2^e m and m between sqrt(1/2) and sqrt(2), ln m = 2 artanh s, s = (m - 1) / (m + 1).
+RF_INLINE Vec log2_above_cut(Vec opacity) {
   const Vec x = max_vec(opacity * (1.0f / kAlphaMin), splat_vec(1.0f));
   const IntVec bits = int_bits(x);
   const IntVec exponent = (bits + -0x3f3504f3) & -0x800000;
   const Vec m = float_bits(bits - exponent), s = (m - 1.0f) / (m + 1.0f), ss = s * s;
   const Vec series = 1.0f + ss * (1.0f / 3.0f + ss * (0.2f + ss * (1.0f / 7.0f + ss * (1.0f / 9.0f))));
-  return 4.0f * s * series + to_float(exponent) * (2.0f * 0.693147180559945f / 0x800000);
+  return (4.0f * kHalfLog2E) * s * series + to_float(exponent) * (1.0f / 0x800000);
 }
 
 RF_INLINE IntVec is_finite(Vec value) { return (int_bits(value) & 0x7f800000) != 0x7f800000; }
 
-RF_INLINE bool all_finite(const float* values, int count) {
-  bool fine = true;
-  for (int at = 0; at < count; ++at) {
-    uint32_t bits;
-    std::memcpy(&bits, values + at, sizeof(bits));
-    fine &= (bits & 0x7f800000u) != 0x7f800000u;
-  }
-  return fine;
-}
-
-RF_INLINE void project_lanes(const View& view, const Parameters& in, const size_t* index, Projection& p) {
+RF_INLINE void project_lanes(const View& view, const Geometry& in, const size_t* index, Projection& p) {
   const float* w = view.rotation;
   const Vec mx = gather(in.means, index, 3, 0), my = gather(in.means, index, 3, 1), mz = gather(in.means, index, 3, 2);
   p.x = w[0] * mx + w[1] * my + w[2] * mz + view.translation[0];
@@ -120,8 +118,8 @@ RF_INLINE void project_lanes(const View& view, const Parameters& in, const size_
   p.inverse_determinant = 1.0f / determinant;
 }
 
-size_t project(const View& view, const Parameters& in, size_t begin, size_t end, Splat* splats, Extent* extents,
-               float* radii) {
+size_t project(const View& view, const Geometry& in, size_t begin, size_t end, const Projected& out) {
+  PinholeSplat* const splats = reinterpret_cast<PinholeSplat*>(out.splats);
   size_t visible = 0;
   for (size_t start = begin; start < end; start += kLanes) {
     size_t index[kLanes];
@@ -138,55 +136,54 @@ size_t project(const View& view, const Parameters& in, size_t begin, size_t end,
     fine &= is_finite(p.screen_x) & is_finite(p.screen_y);
     const Vec middle = 0.5f * (p.sxx + p.syy), half = 0.5f * (p.sxx - p.syy);
     const Vec major = middle + sqrt_vec(half * half + p.sxy * p.sxy);
-    const Vec deviation_x = sqrt_vec(p.sxx), deviation_y = sqrt_vec(p.syy), deviation = sqrt_vec(major);
-    const Vec a = p.syy * p.inverse_determinant, b = -p.sxy * p.inverse_determinant;
-    const Vec c = p.sxx * p.inverse_determinant;
-    fine &= is_finite(a) & is_finite(b) & is_finite(c) & is_finite(major);
-    const Vec squared = reach_of(opacity), reach = sqrt_vec(squared);
-    const Vec box_x = reach * deviation_x, box_y = reach * deviation_y;
-    fine &= (p.screen_x + box_x > 0.0f) & (p.screen_x - box_x < static_cast<float>(view.width));
-    fine &= (p.screen_y + box_y > 0.0f) & (p.screen_y - box_y < static_cast<float>(view.height));
-    for (int lane = 0; lane < lanes; ++lane) radii[start + lane] = 0.0f;
-    alignas(64) float of[11][kLanes];
-    const Vec parts[11] = {p.screen_x, p.screen_y, a, b, c, opacity, squared, box_x, box_y, p.z, reach * deviation};
-    for (int part = 0; part < 11; ++part) store(of[part], parts[part]);
-    for (uint32_t left = bits_of(fine) & ((1u << lanes) - 1u); left != 0; left &= left - 1) {
-      const int lane = __builtin_ctz(left);
-      if (!all_finite(in.values + (start + lane) * in.channels, in.channels)) continue;
+    // Half of d^T Sigma2^-1 d is |(p dx + r dy, s dy)|^2 with a triangular root, which does not cancel.
+    const Vec root_p = sqrt_vec(kHalfLog2E * p.syy * p.inverse_determinant), root_s = sqrt_vec(kHalfLog2E / p.syy);
+    const Vec root_r = -root_p * p.sxy / p.syy;
+    fine &= is_finite(root_p) & is_finite(root_r) & is_finite(root_s) & is_finite(major);
+    const Vec above_cut = log2_above_cut(opacity), reach = sqrt_vec(above_cut * (1.0f / kHalfLog2E));
+    const Vec box_x = reach * sqrt_vec(p.sxx), box_y = reach * sqrt_vec(p.syy);
+    const Vec left = p.screen_x - box_x, top = p.screen_y - box_y;
+    const Vec right = p.screen_x + box_x, bottom = p.screen_y + box_y;
+    fine &= (right > 0.0f) & (left < static_cast<float>(view.width));
+    fine &= (bottom > 0.0f) & (top < static_cast<float>(view.height));
+    for (int lane = 0; lane < lanes; ++lane) out.radii[start + lane] = 0.0f;
+    alignas(64) float of[12][kLanes];
+    const Vec parts[12] = {p.screen_x, p.screen_y,         root_p, root_r, root_s, above_cut + kLog2AlphaMin,
+                           p.z,        reach * sqrt_vec(major), left,   top,    right,  bottom};
+    for (int part = 0; part < 12; ++part) store(of[part], parts[part]);
+    for (uint32_t left_over = bits_of(fine) & ((1u << lanes) - 1u); left_over != 0; left_over &= left_over - 1) {
+      const int lane = __builtin_ctz(left_over);
       splats[visible] = {of[0][lane], of[1][lane], of[2][lane], of[3][lane],
-                         of[4][lane], of[5][lane], of[6][lane], static_cast<uint32_t>(start + lane)};
-      extents[visible] = {of[7][lane], of[8][lane], of[9][lane]};
-      radii[start + lane] = of[10][lane];
+                         of[4][lane], of[5][lane], of[6][lane], 0.0f};
+      out.extents[visible] = {of[8][lane], of[9][lane], of[10][lane], of[11][lane]};
+      out.sources[visible] = static_cast<uint32_t>(start + lane);
+      out.radii[start + lane] = of[7][lane];
       ++visible;
     }
   }
   return visible;
 }
 
-void project_backward(const View& view, const Parameters& in, const Splat* splats, const SplatGradient* gradients,
-                      size_t begin, size_t end, const GeometryGradients& out) {
+void project_backward(const View& view, const Geometry& in, const uint32_t* sources, const float* sums, size_t count,
+                      const GeometryRows& out) {
   const float* w = view.rotation;
-  for (size_t start = begin; start < end; start += kLanes) {
-    const int lanes = static_cast<int>(end - start < kLanes ? end - start : kLanes);
-    size_t index[kLanes];
-    alignas(64) float part[5][kLanes];
+  for (size_t start = 0; start < count; start += kLanes) {
+    const int lanes = static_cast<int>(count - start < kLanes ? count - start : kLanes);
+    size_t index[kLanes], row[kLanes];
     for (int lane = 0; lane < kLanes; ++lane) {
-      const size_t at = start + (lane < lanes ? lane : 0);
-      index[lane] = splats[at].source;
-      const SplatGradient& g = gradients[at];
-      part[0][lane] = g.x;
-      part[1][lane] = g.y;
-      part[2][lane] = g.a;
-      part[3][lane] = g.b;
-      part[4][lane] = g.c;
+      row[lane] = start + (lane < lanes ? lane : 0);
+      index[lane] = sources[row[lane]];
     }
     Projection p;
     project_lanes(view, in, index, p);
-    const Vec gx = load(part[0]), gy = load(part[1]), ga = load(part[2]), gb = 0.5f * load(part[3]), gc = load(part[4]);
-
-    // D = -Q G Q, the gradient with respect to Sigma2.
     const Vec qa = p.syy * p.inverse_determinant, qb = -p.sxy * p.inverse_determinant;
     const Vec qc = p.sxx * p.inverse_determinant;
+    const Vec sum_x = gather(sums, row, 5, 0), sum_y = gather(sums, row, 5, 1);
+    const Vec gx = qa * sum_x + qb * sum_y, gy = qb * sum_x + qc * sum_y;
+    const Vec ga = -0.5f * gather(sums, row, 5, 2), gb = -0.5f * gather(sums, row, 5, 3);
+    const Vec gc = -0.5f * gather(sums, row, 5, 4);
+
+    // D = -Q G Q, the gradient with respect to Sigma2.
     const Vec h00 = ga * qa + gb * qb, h01 = ga * qb + gb * qc, h10 = gb * qa + gc * qb, h11 = gb * qb + gc * qc;
     const Vec d00 = -(qa * h00 + qb * h10), d01 = -(qa * h01 + qb * h11), d11 = -(qb * h01 + qc * h11);
 
@@ -234,16 +231,19 @@ void project_backward(const View& view, const Parameters& in, const Splat* splat
                    inverse_z * inverse_z * (p.x * du + p.y * dv) -
                    inverse_z * inverse_z * (view.fx * p.x * gx + view.fy * p.y * gy);
     for (int lane = 0; lane < lanes; ++lane) {
-      float* means = out.means + 3 * index[lane];
+      float* means = out.means + 3 * row[lane];
+      float* scales = out.scales + 3 * row[lane];
       for (int col = 0; col < 3; ++col) {
         means[col] = w[col] * px[lane] + w[3 + col] * py[lane] + w[6 + col] * pz[lane];
-        out.scales[3 * index[lane] + col] = ds[col][lane];
+        scales[col] = ds[col][lane];
       }
-      float* quats = out.quats + 4 * index[lane];
+      float* quats = out.quats + 4 * row[lane];
       quats[0] = dw[lane];
       quats[1] = dx[lane];
       quats[2] = dy[lane];
       quats[3] = dz[lane];
+      out.offset[2 * row[lane]] = gx[lane];
+      out.offset[2 * row[lane] + 1] = gy[lane];
     }
   }
 }

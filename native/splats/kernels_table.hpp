@@ -1,16 +1,14 @@
 // The table of one instruction set; RF3DGS_KERNELS names the function that returns it.
 #pragma once
 
-#include "splats/kernels_blend.hpp"
 #include "splats/kernels_harmonics.hpp"
 #include "splats/kernels_loss.hpp"
-#include "splats/kernels_project.hpp"
+#include "splats/kernels_pinhole.hpp"
 
 #define RF3DGS_DEFINE_KERNELS(function, name)                                                                  \
   namespace rf3dgs {                                                                                           \
   const Kernels& function() {                                                                                  \
-    static constexpr Kernels table = {name,  ::project, ::project_backward, ::tiles_reached,                   \
-                                      ::blend, ::blend_backward, ::harmonics, ::harmonics_backward,            \
+    static constexpr Kernels table = {name, {pinhole_kernels(), {}}, ::harmonics, ::harmonics_backward,        \
                                       ::ssim_row, ::ssim_gradient_row};                                        \
     return table;                                                                                              \
   }                                                                                                            \

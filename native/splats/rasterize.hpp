@@ -1,48 +1,44 @@
 // The rasterizer: Gaussians in, picture out, and back.
 //
-// Forward: project, sort by view depth (ties by index), list for every 16x16 tile the splats that reach it, blend.
-// Backward: blend once more per tile into a row of gradients per list entry, add these per Gaussian in the order of the
-// tiles, take them back through the projection. Only the lists are in depth order: the splats and all that is kept for
-// them stay in the order of the Gaussians, so that memory is read as it lies. Every sum has one order, so results do not depend on the
-// number of threads.
+// Forward: project and keep what is visible, ask the caller for the values of these, list for every 16x16 tile the
+// splats that reach it, sort each list by depth (ties by index), blend. Backward: blend once more per tile into a row of
+// gradients per list entry, add these per Gaussian in the order of the tiles, take them back through the projection and
+// hand them to the caller. Only the lists are in depth order: the splats and all that is kept for them stay in the order
+// of the Gaussians, so that memory is read as it lies. Every sum has one order and every chunk one place, so results do
+// not depend on the number of threads.
 #pragma once
 
+#include <functional>
 #include <memory>
-#include <vector>
 
-#include "splats/kernels.hpp"
+#include "splats/scene.hpp"
 
 namespace rf3dgs {
 
-// What the backward pass needs of the forward pass.
-struct Scene {
-  View view;
-  size_t gaussians = 0;
-  int channels = 0;
-  int tiles_x = 0, tiles_y = 0;
-  std::vector<Splat> splats;         // the visible ones in the order of the Gaussians
-  std::vector<float> values;         // [splat, channel]
-  std::vector<Entry> entries;        // tile by tile, front to back
-  std::vector<size_t> tile_start;    // [tile + 1]
-  std::vector<size_t> places;        // where each splat's entries are, splat by splat, tiles in order
-  std::vector<size_t> place_start;   // [splat + 1]
-};
+// Writes the values [end - begin, channels] of visible splats begin..end; `sources` are their indices among the caller's
+// Gaussians, both pointers belong to splat `begin`. Called in parallel with chunks that do not overlap. A splat whose
+// values are not finite is not drawn: it keeps its place, reaches no pixel and has a radius of zero.
+using ValuesOf = std::function<void(size_t begin, size_t end, const uint32_t* sources, float* values)>;
 
-std::unique_ptr<Scene> rasterize(const View& view, size_t gaussians, const Parameters& in,
-                                 const float* background, int threads, float* picture, float* weight,
-                                 float* radii);
+// Takes the gradients of visible splats begin..end: of their values [., channels], of opacity [.] and of geometry (null
+// unless it was asked for). All pointers belong to splat `begin`. Called in parallel, once for every visible splat; the
+// chunks' boundaries do not depend on the number of threads.
+using TakeGradients = std::function<void(size_t begin, size_t end, const uint32_t* sources, const float* values_gradient,
+                                         const float* opacity_gradient, const GeometryRows* geometry)>;
 
-// Gradients to be written, [gaussian, ...], zeroed by the caller; null pointers are not computed.
-struct Gradients {
-  float* values;
-  float* opacities;
-  float* means;
-  float* quats;
-  float* scales;
-  float* offset;
-};
+// Draws `count` Gaussians into `picture` [row, col, channel] and `weight` [row, col]; `radii` [gaussian] are pixels (zero
+// where not drawn). `gate` is how far behind the depth of half transmittance Gaussians count [m], infinite for no gate.
+// `max_weight` [gaussian], unless null, keeps the larger of what it holds and the Gaussian's largest weight alpha T over
+// the pixels of this picture.
+std::unique_ptr<Scene> rasterize(const View& view, size_t count, const Geometry& geometry, int channels,
+                                 const ValuesOf& values_of, const float* background, float gate, int threads,
+                                 float* picture, float* weight, float* radii, float* max_weight = nullptr);
 
-void rasterize_backward(const Scene& scene, const Parameters& in, const float* picture, const float* weight,
-                        const float* picture_gradient, const float* weight_gradient, int threads, const Gradients& out);
+enum class Which { appearance, everything };  // values and opacities; geometry as well
+
+// `picture` without its background's share would not do: it is what `rasterize` wrote. `weight_gradient` may be null.
+void rasterize_backward(Scene& scene, const Geometry& geometry, const float* picture, const float* weight,
+                        const float* picture_gradient, const float* weight_gradient, Which which, int threads,
+                        const TakeGradients& take);
 
 }  // namespace rf3dgs

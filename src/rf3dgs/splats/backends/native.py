@@ -60,7 +60,9 @@ class _Rasterize(torch.autograd.Function):
         weight = torch.empty(camera.height, camera.width)
         radii = torch.empty(len(means))
         viewmat, K = (_plain(matrix).float() for matrix in (camera.viewmat, camera.K))
-        scene = core().rasterize(*inputs, viewmat, K, fill, shift, picture, weight, radii, thread_count())
+        scene = core().rasterize(
+            *inputs, viewmat, K, fill, shift, None, picture, weight, radii, None, thread_count()
+        )
         ctx.scene = scene
         ctx.save_for_backward(*inputs, shift, picture, weight)
         ctx.mark_non_differentiable(radii)
@@ -77,15 +79,16 @@ class _Rasterize(torch.autograd.Function):
         of_picture = torch.zeros_like(picture) if of_picture is None else _plain(of_picture)
         of_weight = None if of_weight is None else _plain(of_weight)
         needs = ctx.needs_input_grad
-        geometry = any(needs[:3])
         means, quats, scales, opacities, values = inputs
-        to_means, to_quats, to_scales = (torch.zeros_like(t) if geometry else None for t in (means, quats, scales))
+        to_means, to_quats, to_scales = (
+            torch.zeros_like(tensor) if need else None for tensor, need in zip((means, quats, scales), needs, strict=False)
+        )
         to_opacities = torch.zeros_like(opacities) if needs[3] else None
         to_values = torch.zeros_like(values) if needs[4] else None
         to_offset = torch.zeros_like(shift) if needs[6] else None
         outputs = (to_values, to_opacities, to_means, to_quats, to_scales, to_offset)
         core().rasterize_backward(
-            ctx.scene, *inputs, shift, picture, weight, of_picture, of_weight, *outputs, thread_count()
+            ctx.scene, *inputs[:4], shift, picture, weight, of_picture, of_weight, *outputs, thread_count()
         )
         to_background = None
         if needs[5]:
