@@ -80,9 +80,9 @@ class _Rasterize(torch.autograd.Function):
         of_weight = None if of_weight is None else _plain(of_weight)
         needs = ctx.needs_input_grad
         means, quats, scales, opacities, values = inputs
-        to_means, to_quats, to_scales = (
-            torch.zeros_like(tensor) if need else None for tensor, need in zip((means, quats, scales), needs, strict=False)
-        )
+        to_means = torch.zeros_like(means) if needs[0] else None
+        to_quats = torch.zeros_like(quats) if needs[1] else None
+        to_scales = torch.zeros_like(scales) if needs[2] else None
         to_opacities = torch.zeros_like(opacities) if needs[3] else None
         to_values = torch.zeros_like(values) if needs[4] else None
         to_offset = torch.zeros_like(shift) if needs[6] else None
