@@ -1,23 +1,22 @@
-"""Laws of direction grids, cameras and cube faces."""
+"""Laws of direction grids and views."""
 
 import math
 
 import pytest
 import torch
 
+from rf3dgs.core.angles import direction_of
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import (
     Camera,
+    Panorama,
     equirect_grid,
-    face_cameras,
-    face_grid,
     list_grid,
     pinhole_grid,
-    sample_faces,
     sample_grid,
+    view_of,
 )
-from rf3dgs.core.grids import device_from_faces as face_rotations
 
 LEFT = torch.tensor([0.0, 1.0, 0.0])
 UP = torch.tensor([0.0, 0.0, 1.0])
@@ -61,20 +60,33 @@ def test_a_camera_projects_a_point_where_its_grid_looks() -> None:
     torch.testing.assert_close(camera.resized(32, 24).K[0, 0], camera.K[0, 0] / 2)
 
 
-def test_six_faces_cover_the_sphere_without_a_seam() -> None:
-    grid, face = equirect_grid(90, 45), face_grid(32)
-    faces = torch.stack([face.directions @ rotation.mT for rotation in face_rotations()])
-    torch.testing.assert_close(sample_faces(faces, 32, grid.directions), grid.directions, atol=2e-3, rtol=0)
-    rotations = face_rotations()
-    torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(6))
+def test_a_panorama_is_the_sphere_of_its_pose_and_grid() -> None:
+    pose = Pose.look_at((1.0, 2.0, 1.5), (5.0, 4.0, 1.0))
+    view = Panorama.of(pose, equirect_grid(24, 12))
+    torch.testing.assert_close(view.position, pose.position, atol=1e-5, rtol=0)
+    torch.testing.assert_close(view.pose.to_world(LEFT), pose.to_world(LEFT), atol=1e-5, rtol=0)
+    assert view.grid.same_as(equirect_grid(24, 12))
+    assert (view.resized(10, 5).width, view.resized(10, 5).height) == (10, 5)
+    assert torch.equal(view.resized(10, 5).viewmat, view.viewmat)
 
 
-def test_face_cameras_turn_with_the_pose() -> None:
-    pose = Pose.look_at((0.0, 0.0, 1.0), (1.0, 2.0, 1.5))
-    forward = torch.tensor([1.0, 0.0, 0.0])
-    cameras = face_cameras(pose, 16)
-    torch.testing.assert_close(cameras[1].pose.to_world(forward), pose.to_world(LEFT), atol=1e-5, rtol=0)
-    torch.testing.assert_close(cameras[4].pose.to_world(forward), pose.to_world(UP), atol=1e-5, rtol=0)
+def test_a_grid_decides_which_view_it_makes() -> None:
+    pose = Pose((0.0, 0.0, 0.0))
+    assert isinstance(view_of(pose, pinhole_grid(8, 6, 90)), Camera)
+    assert isinstance(view_of(pose, equirect_grid(8, 4)), Panorama)
+    with pytest.raises(InputError, match="a view needs a pinhole or equirectangular grid; got a list of directions"):
+        view_of(pose, list_grid(torch.eye(3)))
+
+
+@pytest.mark.parametrize("width", [16, 17])
+def test_sampling_over_the_poles_meets_the_other_side_of_odd_and_even_widths(width: int) -> None:
+    grid = equirect_grid(width, 9)
+    picture = 1.0 + grid.directions[..., :1].double()
+    azimuth = torch.linspace(-3.0, 3.0, 50, dtype=torch.float64)
+    for zenith in (0.02, 0.12, math.pi - 0.05):
+        directions = direction_of(torch.full_like(azimuth, zenith), azimuth)
+        found = sample_grid(picture, grid, directions)[:, 0]
+        torch.testing.assert_close(found, 1 + directions[:, 0], atol=6e-3, rtol=0)
 
 
 def test_sampling_wraps_at_the_seam_and_over_the_poles() -> None:
@@ -93,9 +105,11 @@ def test_bad_grids_are_refused() -> None:
         equirect_grid(0, 5)
     with pytest.raises(InputError, match="needs either fov_deg or K"):
         pinhole_grid(10, 10)
-    with pytest.raises(InputError, match="a camera needs a pinhole grid; got equirect"):
+    with pytest.raises(InputError, match=r"a camera needs a pinhole grid; got equirect\. view_of makes"):
         Camera.of(Pose((0.0, 0.0, 0.0)), equirect_grid(8, 4))
-    with pytest.raises(InputError, match=r"a camera stands at one pose; got \[2\]"):
+    with pytest.raises(InputError, match="a panorama needs an equirectangular grid; got pinhole"):
+        Panorama.of(Pose((0.0, 0.0, 0.0)), pinhole_grid(8, 4, 90))
+    with pytest.raises(InputError, match=r"a view stands at one pose; got \[2\]"):
         Camera.of(Pose(torch.zeros(2, 3)), pinhole_grid(4, 4, 90))
     for K in (
         torch.eye(2),

@@ -9,11 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from rf3dgs.core.cube import face_cameras
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import Camera, face_cameras, pinhole_grid
+from rf3dgs.core.grids import Camera, Panorama, equirect_grid, pinhole_grid
 from rf3dgs.splats import constants
 from rf3dgs.splats.backends.core import native_core, thread_count
+from rf3dgs.splats.compositing import Compositing
 from rf3dgs.splats.rasterize import pick_backend, rasterize
 from rf3dgs.splats.reference import rasterize_reference
 
@@ -244,6 +246,22 @@ def test_wrong_dtypes_and_backends_are_named():
         rasterize(*tensors, camera(), background=torch.zeros(1))
 
 
+def test_options_that_do_not_go_together_are_named():
+    tensors, panorama = cloud(5), Panorama.of(POSE, equirect_grid(8, 4))
+    with pytest.raises(InputError, match="a panorama has no screen"):
+        rasterize(*tensors, panorama, screen_offset=torch.zeros(5, 2))
+    with pytest.raises(InputError, match="normalise divides by the weight"):
+        rasterize(*tensors, camera(), background=torch.zeros(3), compositing=Compositing(normalise=True))
+    with pytest.raises(InputError, match=r"added must be \[row, col, channel\] = \[48, 64, 3\]; got \[48, 64\]"):
+        rasterize(*tensors, camera(), added=torch.zeros(48, 64))
+    with pytest.raises(InputError, match=r"added must be torch\.float32 on cpu as values are; got torch\.float64"):
+        rasterize(*tensors, camera(), added=torch.zeros(48, 64, 3, dtype=torch.float64))
+    with pytest.raises(InputError, match=r"one for each channel \(3\); got 2 names"):
+        rasterize(*tensors, camera(), compositing=Compositing(transfer=("identity", "identity")))
+    with pytest.raises(InputError, match="view must be a Camera or a Panorama; got DirectionGrid"):
+        rasterize(*tensors, pinhole_grid(8, 6, 90.0))  # type: ignore[arg-type]
+
+
 def test_the_backend_is_chosen_by_what_the_tensors_are(monkeypatch: pytest.MonkeyPatch):
     assert pick_backend()[0] == "native"
     assert pick_backend("cuda")[0] == "gsplat"
@@ -270,7 +288,7 @@ CLOUD = """
 import torch
 torch.set_num_threads(1)  # torch's own threads do not survive a fork; the core's pool starts anew
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import Camera, pinhole_grid
+from rf3dgs.core.grids import Camera, Panorama, equirect_grid, pinhole_grid
 from rf3dgs.splats.rasterize import rasterize
 def draw():
     g = torch.Generator().manual_seed(0)

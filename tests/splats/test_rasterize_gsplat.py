@@ -6,9 +6,9 @@ from typing import Any, cast
 import pytest
 import torch
 
-from rf3dgs.core.errors import MissingDependencyError
-from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import Camera, pinhole_grid
+from rf3dgs.core.errors import InputError, MissingDependencyError
+from rf3dgs.core.frames import CAMERA_FROM_DEVICE, Pose
+from rf3dgs.core.grids import Camera, Panorama, equirect_grid, pinhole_grid
 from rf3dgs.splats.backends.gsplat import load_gsplat, rasterize_gsplat
 
 
@@ -47,6 +47,36 @@ def test_the_call_says_what_gsplat_expects():
     raster.values.sum().backward()
     assert offset.grad is not None
     assert torch.equal(offset.grad, torch.full((5, 2), 192.0))
+
+
+def test_a_panorama_is_six_pictures_of_a_cube_that_agree_with_its_directions():
+    """The stand-in paints the world direction that each pixel looks in, times a value."""
+
+    def rasterization(**options):
+        K, viewmat = options["Ks"][0], options["viewmats"][0]
+        directions = pinhole_grid(options["width"], options["height"], K=K).directions @ CAMERA_FROM_DEVICE.mT
+        picture = (directions @ viewmat[:3, :3])[None] * options["colors"][0, 0]
+        weight = torch.full((1, options["height"], options["width"], 1), 0.5)
+        return picture, weight, {"radii": torch.full((1, 5), 3), "means2d": torch.zeros(1, 5, 2)}
+
+    values = torch.ones(5, 3, requires_grad=True)
+    pose = Pose.look_at(position=(-3.0, 0.0, 0.0), target=(0.0, 1.0, 0.5))
+    panorama = Panorama.of(pose, equirect_grid(48, 24))
+    module = cast(Any, SimpleNamespace(rasterization=rasterization))
+    gaussians = (torch.rand(5, 3), torch.rand(5, 4), torch.rand(5, 3), torch.rand(5), values)
+    raster = rasterize_gsplat(*gaussians, panorama, module=module)
+    torch.testing.assert_close(raster.values.detach(), pose.to_world(panorama.grid.directions), atol=5e-3, rtol=0)
+    torch.testing.assert_close(raster.weight, torch.full((24, 48), 0.5))
+    assert raster.radii.tolist() == [3.0] * 5
+    raster.values.square().sum().backward()
+    assert values.grad is not None
+    assert float(values.grad[0].sum()) == pytest.approx(2 * 24 * 48, rel=1e-2)
+
+
+def test_the_depth_gate_is_refused_and_other_backends_are_named():
+    gaussians = (torch.rand(5, 3), torch.rand(5, 4), torch.rand(5, 3), torch.rand(5), torch.rand(5, 1))
+    with pytest.raises(InputError, match='gsplat backend has no depth gate; use backend="native" or "reference"'):
+        rasterize_gsplat(*gaussians, view(), depth_gate=0.3, module=cast(Any, SimpleNamespace()))
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")

@@ -6,8 +6,9 @@ import torch
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, pinhole_grid
 from rf3dgs.splats.constants import ALPHA_MIN, BLUR
+from rf3dgs.splats.projection import extent
 from rf3dgs.splats.raster import Raster
-from rf3dgs.splats.reference import extent, rasterize_reference
+from rf3dgs.splats.reference import rasterize_reference
 
 F64 = torch.float64
 

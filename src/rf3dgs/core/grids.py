@@ -66,7 +66,7 @@ class DirectionGrid:
             return torch.stack((x, y), -1), torch.ones_like(x, dtype=torch.bool)
         if self.K is None:
             raise InputError("a list of directions has no pixels; use a pinhole or equirectangular grid")
-        camera = directions @ CAMERA_FROM_DEVICE.to(directions.dtype).mT
+        camera = directions @ CAMERA_FROM_DEVICE.to(directions).mT
         ahead = camera[..., 2] > 1e-9
         depth = torch.where(ahead, camera[..., 2], torch.ones_like(camera[..., 2]))
         x = self.K[0, 0] * camera[..., 0] / depth + self.K[0, 2]
@@ -146,10 +146,8 @@ class Camera:
     def of(cls, pose: Pose, grid: DirectionGrid) -> "Camera":
         """The camera that sees what a pinhole `grid` sees at one `pose`."""
         if grid.K is None:
-            raise InputError(f"a camera needs a pinhole grid; got {grid.kind}. Render other grids through cube faces")
-        if pose.batch_shape:
-            raise InputError(f"a camera stands at one pose; got {list(pose.batch_shape)}. Choose one, as in pose[0]")
-        return cls(pose.viewmat, grid.K, grid.width, grid.height)
+            raise InputError(f"a camera needs a pinhole grid; got {grid.kind}. view_of makes the view of either grid")
+        return cls(_one_viewmat(pose), grid.K, grid.width, grid.height)
 
     @property
     def pose(self) -> Pose:
@@ -158,7 +156,7 @@ class Camera:
     @property
     def position(self) -> Tensor:
         """The camera's centre `[3]` in the world [m]."""
-        return -(self.viewmat[:3, :3].mT @ self.viewmat[:3, 3])
+        return _centre(self.viewmat)
 
     @property
     def grid(self) -> DirectionGrid:
@@ -170,39 +168,57 @@ class Camera:
         return Camera(self.viewmat, scale[:, None] * self.K, width, height)
 
 
-FACE_FORWARD_UP = (
-    ((1, 0, 0), (0, 0, 1)),
-    ((0, 1, 0), (0, 0, 1)),
-    ((-1, 0, 0), (0, 0, 1)),
-    ((0, -1, 0), (0, 0, 1)),
-    ((0, 0, 1), (-1, 0, 0)),
-    ((0, 0, -1), (1, 0, 0)),
-)
+@dataclass(frozen=True, eq=False)
+class Panorama:
+    """The whole sphere at one pose: `viewmat` `[4, 4]` camera_from_world, pixels as in `equirect_grid`."""
+
+    viewmat: Tensor
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, pose: Pose, grid: DirectionGrid) -> "Panorama":
+        """What an equirectangular `grid` sees at one `pose`."""
+        if grid.kind != "equirect":
+            raise InputError(f"a panorama needs an equirectangular grid; got {grid.kind}")
+        return cls(_one_viewmat(pose), grid.width, grid.height)
+
+    @property
+    def pose(self) -> Pose:
+        return Pose.from_viewmat(self.viewmat)
+
+    @property
+    def position(self) -> Tensor:
+        """The centre of the sphere `[3]` in the world [m]."""
+        return _centre(self.viewmat)
+
+    @property
+    def grid(self) -> DirectionGrid:
+        return equirect_grid(self.width, self.height)
+
+    def resized(self, width: int, height: int) -> "Panorama":
+        """The same sphere with another number of pixels."""
+        return Panorama(self.viewmat, width, height)
 
 
-def face_grid(size: int, *, margin: int = 1) -> DirectionGrid:
-    """One cube face of `size` x `size` pixels over 90 degrees, with `margin` more pixels on every side.
-
-    The margin lets neighbouring faces overlap, so that interpolation needs no seam rules.
-    """
-    focal = 0.5 * size
-    centre = 0.5 * size + margin
-    K = torch.tensor([[focal, 0.0, centre], [0.0, focal, centre], [0.0, 0.0, 1.0]])
-    return pinhole_grid(size + 2 * margin, size + 2 * margin, K=K)
+View = Camera | Panorama
 
 
-def device_from_faces() -> Tensor:
-    """Rotations `[6, 3, 3]` from each face's frame to the device frame: front, left, back, right, up, down."""
-    forward = torch.tensor([face[0] for face in FACE_FORWARD_UP], dtype=torch.float32)
-    up = torch.tensor([face[1] for face in FACE_FORWARD_UP], dtype=torch.float32)
-    return torch.stack((forward, torch.linalg.cross(up, forward, dim=-1), up), -1)
+def view_of(pose: Pose, grid: DirectionGrid) -> View:
+    """What a pinhole or equirectangular `grid` sees at one `pose`, as the rasterizer takes it."""
+    if grid.kind == "list":
+        raise InputError("a view needs a pinhole or equirectangular grid; got a list of directions")
+    return Camera.of(pose, grid) if grid.kind == "pinhole" else Panorama.of(pose, grid)
 
 
-def face_cameras(pose: Pose, size: int, *, margin: int = 1) -> list[Camera]:
-    """The six cameras that see the whole sphere around one pose."""
-    grid = face_grid(size, margin=margin)
-    rotations = pose.world_from_device @ device_from_faces()
-    return [Camera.of(Pose.from_matrix(pose.position, rotation), grid) for rotation in rotations]
+def _one_viewmat(pose: Pose) -> Tensor:
+    if pose.batch_shape:
+        raise InputError(f"a view stands at one pose; got {list(pose.batch_shape)}. Choose one, as in pose[0]")
+    return pose.viewmat
+
+
+def _centre(viewmat: Tensor) -> Tensor:
+    return -(viewmat[:3, :3].mT @ viewmat[:3, 3])
 
 
 def sample_grid(picture: Tensor, grid: DirectionGrid, directions: Tensor) -> Tensor:
@@ -213,31 +229,18 @@ def sample_grid(picture: Tensor, grid: DirectionGrid, directions: Tensor) -> Ten
     pixel, _ = grid.pixel_of(directions)
     height, width = grid.shape
     x, y = pixel[..., 0] - 0.5, pixel[..., 1] - 0.5
-    x0, y0 = torch.floor(x), torch.floor(y)
-    fx, fy = (x - x0)[..., None], (y - y0)[..., None]
+    y0 = torch.floor(y)
+    fy = (y - y0)[..., None]
     total = torch.zeros(())
-    for dx, wx in ((0, 1 - fx), (1, fx)):
-        for dy, wy in ((0, 1 - fy), (1, fy)):
-            col, row = (x0 + dx).long(), (y0 + dy).long()
-            if grid.kind == "equirect":
-                over_pole = (row < 0) | (row >= height)
-                row = torch.where(row < 0, -row - 1, torch.where(row >= height, 2 * height - 1 - row, row))
-                col = torch.where(over_pole, col + width // 2, col) % width
-            else:
-                row, col = row.clamp(0, height - 1), col.clamp(0, width - 1)
+    for dy, wy in ((0, 1 - fy), (1, fy)):
+        row, across = (y0 + dy).long(), x
+        if grid.kind == "equirect":
+            across = torch.where((row < 0) | (row >= height), x + width / 2, x)
+            row = torch.where(row < 0, -row - 1, torch.where(row >= height, 2 * height - 1 - row, row))
+        row, x0 = row.clamp(0, height - 1), torch.floor(across)
+        fx = (across - x0)[..., None]
+        for dx, wx in ((0, 1 - fx), (1, fx)):
+            col = (x0 + dx).long()
+            col = col % width if grid.kind == "equirect" else col.clamp(0, width - 1)
             total = total + wx * wy * picture[row, col]
     return total
-
-
-def sample_faces(faces: Tensor, size: int, directions: Tensor, *, margin: int = 1) -> Tensor:
-    """Values `[*batch, channel]` at device-frame directions of six face pictures `[6, row, col, channel]`."""
-    rotations = device_from_faces()
-    along = directions @ rotations[:, :, 0].mT
-    face = along.argmax(-1)
-    grid = face_grid(size, margin=margin)
-    result = faces.new_zeros(*directions.shape[:-1], faces.shape[-1])
-    for index in range(6):
-        chosen = face == index
-        local = directions[chosen] @ rotations[index]
-        result[chosen] = sample_grid(faces[index], grid, local)
-    return result

@@ -13,9 +13,10 @@ from torch import Tensor
 
 from rf3dgs.channel.paths import Paths
 from rf3dgs.core.angles import angles_of
+from rf3dgs.core.cube import face_cameras, sample_faces
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import Camera, DirectionGrid, equirect_grid, face_cameras, sample_faces
+from rf3dgs.core.grids import Camera, DirectionGrid, equirect_grid
 from rf3dgs.field.radiance import Radiance, Surface, decode, picture_of
 from rf3dgs.field.sources import Blockers, PointSource
 from rf3dgs.spectra.codec import DbWindow

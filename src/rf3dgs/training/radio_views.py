@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.angles import angle_between
+from rf3dgs.core.cube import device_from_faces, face_cameras, face_grid
 from rf3dgs.core.errors import InputError
-from rf3dgs.core.grids import Camera, device_from_faces, face_cameras, face_grid, sample_grid
+from rf3dgs.core.grids import Camera, sample_grid
 from rf3dgs.field.sources import PointSource
 from rf3dgs.spectra.codec import DbWindow, PaperEncoding
 from rf3dgs.spectra.spectrum import Spectrum

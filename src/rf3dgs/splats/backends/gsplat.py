@@ -1,13 +1,15 @@
 """gsplat's CUDA rasterizer behind the package's own signature (for machines with an NVIDIA GPU)."""
 
 import importlib
+import math
 from types import ModuleType
 
 import torch
 from torch import Tensor
 
-from rf3dgs.core.errors import MissingDependencyError
-from rf3dgs.core.grids import Camera
+from rf3dgs.core.cube import face_cameras, sample_faces
+from rf3dgs.core.errors import InputError, MissingDependencyError
+from rf3dgs.core.grids import Camera, View
 from rf3dgs.splats.constants import BLUR, NEAR
 from rf3dgs.splats.raster import Raster
 
@@ -33,19 +35,48 @@ def rasterize_gsplat(
     scales: Tensor,
     opacities: Tensor,
     values: Tensor,
-    camera: Camera,
+    view: View,
     *,
     background: Tensor | None = None,
     screen_offset: Tensor | None = None,
+    depth_gate: float | None = None,
     module: ModuleType | None = None,
 ) -> Raster:
-    """`rasterize` by gsplat (`module`, or the installed one); see there.
+    """Blended channels of `rasterize` by gsplat (`module`, or the installed one); see there.
 
     The constants are gsplat's own: alpha cut and stop agree with this package, its boxes end at 3.33 standard
     deviations. The gradient with respect to the projected centres, which passes gsplat's `means2d`, is added to
-    `screen_offset.grad`; offsets other than zero are not supported.
+    `screen_offset.grad`; offsets other than zero are not supported. A panorama costs six pictures, which are
+    interpolated: faces of a cube whose middle pixels are as wide as the panorama's, six tenths of its width squared in
+    all. gsplat knows no depth gate.
     """
+    if depth_gate is not None:
+        raise InputError(
+            'the gsplat backend has no depth gate; use backend="native" or "reference", or leave depth_gate out'
+        )
     gsplat = load_gsplat() if module is None else module
+    gaussians = (means, quats, scales, opacities, values)
+    if isinstance(view, Camera):
+        return _pinhole(gsplat, *gaussians, view, background, screen_offset)
+    size = max(8, math.ceil(view.width / math.pi))
+    faces = [_pinhole(gsplat, *gaussians, camera, background, None) for camera in face_cameras(view.pose, size)]
+    pictures = torch.stack([torch.cat((face.values, face.weight[..., None]), -1) for face in faces])
+    sampled = sample_faces(pictures, size, view.grid.directions.to(means))
+    radii = torch.stack([face.radii for face in faces]).amax(0)
+    return Raster(sampled[..., :-1], sampled[..., -1], radii)
+
+
+def _pinhole(
+    gsplat: ModuleType,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    values: Tensor,
+    camera: Camera,
+    background: Tensor | None,
+    screen_offset: Tensor | None,
+) -> Raster:
     device = means.device
     viewmat, K = camera.viewmat.to(device), camera.K.to(device)
     values_out, weight, info = gsplat.rasterization(

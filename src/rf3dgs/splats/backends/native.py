@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rf3dgs.core.errors import MissingDependencyError
-from rf3dgs.core.grids import Camera
+from rf3dgs.core.errors import InputError, MissingDependencyError
+from rf3dgs.core.grids import Camera, View
 from rf3dgs.splats.backends.core import native_core, native_failure, thread_count
 from rf3dgs.splats.raster import Raster
 
@@ -52,6 +52,7 @@ class _Rasterize(torch.autograd.Function):
         background: Tensor | None,
         offset: Tensor | None,
         camera: Camera,
+        gate: float | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         inputs = [None if tensor is None else _plain(tensor) for tensor in (means, quats, scales, opacities, values)]
         fill = None if background is None else _plain(background)
@@ -60,9 +61,7 @@ class _Rasterize(torch.autograd.Function):
         weight = torch.empty(camera.height, camera.width)
         radii = torch.empty(len(means))
         viewmat, K = (_plain(matrix).float() for matrix in (camera.viewmat, camera.K))
-        scene = core().rasterize(
-            *inputs, viewmat, K, fill, shift, None, picture, weight, radii, None, thread_count()
-        )
+        scene = core().rasterize(*inputs, viewmat, K, fill, shift, gate, picture, weight, radii, None, thread_count())
         ctx.scene = scene
         ctx.save_for_backward(*inputs, shift, picture, weight)
         ctx.mark_non_differentiable(radii)
@@ -75,7 +74,7 @@ class _Rasterize(torch.autograd.Function):
         of_picture, of_weight, _ = gradients
         *inputs, shift, picture, weight = ctx.saved_tensors
         if of_picture is None and of_weight is None:
-            return (None,) * 8
+            return (None,) * 9
         of_picture = torch.zeros_like(picture) if of_picture is None else _plain(of_picture)
         of_weight = None if of_weight is None else _plain(of_weight)
         needs = ctx.needs_input_grad
@@ -94,7 +93,7 @@ class _Rasterize(torch.autograd.Function):
         if needs[5]:
             to_background = torch.einsum("hwc,hw->c", of_picture, 1 - weight)
         result = (to_means, to_quats, to_scales, to_opacities, to_values, to_background, to_offset)
-        return (*(gradient if need else None for gradient, need in zip(result, needs, strict=False)), None)
+        return (*(gradient if need else None for gradient, need in zip(result, needs, strict=False)), None, None)
 
 
 def rasterize_native(
@@ -103,13 +102,16 @@ def rasterize_native(
     scales: Tensor,
     opacities: Tensor,
     values: Tensor,
-    camera: Camera,
+    view: View,
     *,
     background: Tensor | None = None,
     screen_offset: Tensor | None = None,
+    depth_gate: float | None = None,
 ) -> Raster:
-    """`rasterize` by the native core; see there."""
-    arguments = (means, quats, scales, opacities, values, background, screen_offset, camera)
+    """Blended channels of `rasterize` by the native core; see there."""
+    if not isinstance(view, Camera):
+        raise InputError('the native backend draws cameras alone; use backend="reference" for panoramas')
+    arguments = (means, quats, scales, opacities, values, background, screen_offset, view, depth_gate)
     return Raster(*_Rasterize.apply(*arguments))  # type: ignore[misc]
 
 
