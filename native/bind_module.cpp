@@ -12,6 +12,7 @@
 #include <stdexcept>
 #include <thread>
 
+#include "bind_floor.hpp"
 #include "core/thread_pool.hpp"
 #include "splats/constants.hpp"
 #include "splats/image_loss.hpp"
@@ -248,4 +249,5 @@ NB_MODULE(_native, m) {
   m.def("l1_ssim", &picture_loss, nb::arg("picture").noconvert(), nb::arg("target").noconvert(),
         nb::arg("weight").noconvert().none(), nb::arg("ssim_weight"), nb::arg("gradient").noconvert().none(),
         nb::arg("threads"));
+  bind_floor(m);
 }

@@ -1,5 +1,7 @@
 """A synthetic room of flattened Gaussians and a view of it."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -36,3 +38,21 @@ def view(width: int = 300, height: int = 200) -> Camera:
     return Camera.of(
         Pose.look_at(position=(2.0, 3.0, 1.5), target=(11.0, 12.0, 1.2)), pinhole_grid(width, height, 90.0)
     )
+
+
+def poses(count: int, *, seed: int = 0) -> list[Pose]:
+    """Where a visitor stands who looks about: at least 1 m from the walls, 1.2 to 2 m high, any way, a little up or down."""
+    generator = torch.Generator().manual_seed(seed)
+    low, high = torch.tensor([1.0, 1.0, 1.2]), torch.tensor([ROOM[0] - 1.0, ROOM[1] - 1.0, 2.0])
+    result = []
+    for _ in range(count):
+        place = low + (high - low) * torch.rand(3, generator=generator)
+        yaw, pitch = (2 * math.pi, 0.4) * (torch.rand(2, generator=generator).numpy() - (0.0, 0.5))
+        ahead = torch.tensor([math.cos(yaw), math.sin(yaw), math.tan(pitch)], dtype=torch.float32)
+        result.append(Pose.look_at(position=tuple(place.tolist()), target=tuple((place + ahead).tolist())))
+    return result
+
+
+def views(count: int, width: int = 300, height: int = 200, *, seed: int = 0) -> list[Camera]:
+    """Pinhole cameras of 90 degrees at `poses`."""
+    return [Camera.of(pose, pinhole_grid(width, height, 90.0)) for pose in poses(count, seed=seed)]
