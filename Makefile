@@ -1,7 +1,7 @@
 # make demo   set everything up and run the main job on the built-in lobby
 # make test   set everything up and run the tests
 # make lint   formatting, types, import contract
-# make bench  speed of the splatting core, measured against its reference in the same run
+# make bench  speed of the splatting core against this machine's floor and the reference, measured in the same run
 # make twin   trace, photograph and train the built-in lobby afresh: the data that ships inside the package
 #
 # Variables: PYTHON (3.11 to 3.13), VENV, and TORCH_INDEX, the package index torch comes from: name PyTorch's CPU index
@@ -58,7 +58,7 @@ format: $(VENV)/test.stamp
 	$(BIN)/ruff format .
 
 bench: $(VENV)/test.stamp
-	$(BIN)/python -m benchmarks.speed.step --json $(OUT)/bench.json
+	$(BIN)/python -m benchmarks.speed.table --json $(OUT)/bench/table.json
 	$(BIN)/python -m pytest benchmarks/speed --benchmark-only --benchmark-columns=min,median,rounds
 
 twin: $(VENV)/test.stamp

@@ -2,10 +2,10 @@
 
     python -m benchmarks.speed.floor [--seconds 2]
 
-measures multiply-adds per second and memory bandwidth and prints them with the floors of the benchmark's scenes. A phase
-of the work takes at least max(vector operations / their rate, bytes / bandwidth); the floor is the sum over the phases.
-The counts below are those of the algorithm, not of the code; docs/performance.md derives each one. A vector operation
-handles sixteen floats: a multiply-add, addition, comparison, selection or division counts one.
+measures multiply-adds per second and memory bandwidth. A phase of the work takes at least max(vector operations / their
+rate, bytes / bandwidth); the floor is the sum over the phases. The counts below are those of the algorithm, not of the
+code; docs/performance.md derives each one. A vector operation handles sixteen floats: a multiply-add, addition,
+comparison, selection or division counts one.
 """
 
 import argparse
@@ -59,9 +59,9 @@ class Work:
     """What a picture consists of."""
 
     gaussians: int
-    visible: int
-    entries: int  # (Gaussian, 16x16 tile)
-    pairs: int  # (Gaussian, 4x4 block of pixels)
+    visible: float
+    entries: float  # (Gaussian, 16x16 tile)
+    pairs: float  # (Gaussian, 4x4 block of pixels)
     pixels: int
     channels: int
     coefficients: int = 16
@@ -156,19 +156,6 @@ def main() -> int:
             f"({2 * LANES * machine.vectors / 1e9:.0f} GFLOP/s), read {machine.read / 1e9:.1f} GB/s, "
             f"change {machine.changed / 1e9:.1f} GB/s"
         )
-    examples = {
-        50_000: (29_724, 52_470, 155_114),
-        100_000: (58_447, 92_566, 234_080),
-        200_000: (116_565, 170_557, 385_638),
-    }
-    print("floors, 300x200, ms of all threads together (on the issue's two Zen 5 cores: of the clock)")
-    for count, (visible, entries, pairs) in examples.items():
-        for channels in (3, 1):
-            work = Work(count, visible, entries, pairs, 60_000, channels)
-            kinds = {"render": render(work), "frozen": step(work, frozen=True), "full": step(work, frozen=False)}
-            here = ", ".join(f"{name} {floor_ms(phases, machine):.2f}" for name, phases in kinds.items())
-            there = ", ".join(f"{floor_ms(phases, TWO_ZEN5_CORES) / 2:.2f}" for phases in kinds.values())
-            print(f"  {count:7d} Gaussians, {channels} channels: {here} ({there})")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""A synthetic room of flattened Gaussians and a view of it."""
+"""A synthetic room of flattened Gaussians and views of it."""
 
 import math
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import Camera, pinhole_grid
+from rf3dgs.core.grids import Camera, Panorama, equirect_grid, pinhole_grid
 
 ROOM = (14.0, 15.0, 3.5)  # m
 
@@ -33,15 +33,8 @@ def room(count: int, *, channels: int = 3, seed: int = 0) -> dict[str, Tensor]:
     return {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
 
 
-def view(width: int = 300, height: int = 200) -> Camera:
-    """A view through the room's length."""
-    return Camera.of(
-        Pose.look_at(position=(2.0, 3.0, 1.5), target=(11.0, 12.0, 1.2)), pinhole_grid(width, height, 90.0)
-    )
-
-
 def poses(count: int, *, seed: int = 0) -> list[Pose]:
-    """Where a visitor stands who looks about: at least 1 m from the walls, 1.2 to 2 m high, any way, a little up or down."""
+    """Where a visitor looks about: at least 1 m from the walls, 1.2 to 2 m high, any way, a little up or down."""
     generator = torch.Generator().manual_seed(seed)
     low, high = torch.tensor([1.0, 1.0, 1.2]), torch.tensor([ROOM[0] - 1.0, ROOM[1] - 1.0, 2.0])
     result = []
@@ -53,6 +46,11 @@ def poses(count: int, *, seed: int = 0) -> list[Pose]:
     return result
 
 
-def views(count: int, width: int = 300, height: int = 200, *, seed: int = 0) -> list[Camera]:
+def cameras_of(count: int, width: int = 300, height: int = 200, *, seed: int = 0) -> list[Camera]:
     """Pinhole cameras of 90 degrees at `poses`."""
     return [Camera.of(pose, pinhole_grid(width, height, 90.0)) for pose in poses(count, seed=seed)]
+
+
+def panoramas(count: int, width: int = 360, height: int = 180, *, seed: int = 0) -> list[Panorama]:
+    """Whole spheres at `poses`."""
+    return [Panorama.of(pose, equirect_grid(width, height)) for pose in poses(count, seed=seed)]
