@@ -1,8 +1,5 @@
 // What Python sees. Arrays are float32, C-contiguous, on the CPU and never converted: the Python side prepares them and
 // checks shapes, this file only refuses what could read past an end. The GIL is released while the core works.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/optional.h>
 #include <nanobind/stl/unique_ptr.h>
 
 #include <algorithm>
@@ -12,55 +9,17 @@
 #include <stdexcept>
 #include <thread>
 
+#include "bind.hpp"
 #include "bind_floor.hpp"
 #include "core/thread_pool.hpp"
 #include "splats/constants.hpp"
-#include "splats/image_loss.hpp"
 #include "splats/kernels.hpp"
 #include "splats/rasterize.hpp"
 
-namespace nb = nanobind;
-using namespace nb::literals;
 using namespace rf3dgs;
+using namespace nb::literals;
 
 namespace {
-
-template <int... Shape>
-using In = nb::ndarray<const float, nb::shape<Shape...>, nb::c_contig, nb::device::cpu>;
-template <int... Shape>
-using Out = nb::ndarray<float, nb::shape<Shape...>, nb::c_contig, nb::device::cpu>;
-
-void require(bool fine, const char* message) {
-  if (!fine) throw std::invalid_argument(message);
-}
-
-template <class Array>
-auto* data_or_null(const std::optional<Array>& array) {
-  return array ? array->data() : nullptr;
-}
-
-View view_of(const In<4, 4>& viewmat, const In<3, 3>& camera, int width, int height) {
-  require(width > 0 && height > 0, "a picture needs at least one pixel each way");
-  View view{};
-  view.kind = Kind::pinhole;
-  const float* m = viewmat.data();
-  const float* k = camera.data();
-  for (int row = 0; row < 3; ++row) {
-    for (int col = 0; col < 3; ++col) view.rotation[3 * row + col] = m[4 * row + col];
-    view.translation[row] = m[4 * row + 3];
-  }
-  view.fx = k[0];
-  view.fy = k[4];
-  view.cx = k[2];
-  view.cy = k[5];
-  view.width = width;
-  view.height = height;
-  view.u_low = -kFieldClamp * view.cx / view.fx;
-  view.u_high = kFieldClamp * (width - view.cx) / view.fx;
-  view.v_low = -kFieldClamp * view.cy / view.fy;
-  view.v_high = kFieldClamp * (height - view.cy) / view.fy;
-  return view;
-}
 
 Geometry geometry_of(const In<-1, 3>& means, const In<-1, 4>& quats, const In<-1, 3>& scales, const In<-1>& opacities,
                      const std::optional<In<-1, 2>>& offset) {
@@ -176,20 +135,6 @@ void harmonics_backward(In<-1, -1> gradient, In<-1, 3> directions, Out<-1, -1, -
   });
 }
 
-double picture_loss(In<-1, -1, -1> picture, In<-1, -1, -1> target, std::optional<In<-1, -1>> weight, float ssim_weight,
-                    std::optional<Out<-1, -1, -1>> gradient, int threads) {
-  const size_t height = picture.shape(0), width = picture.shape(1), channels = picture.shape(2);
-  const auto fits = [&](const auto& array) {
-    return array.shape(0) == height && array.shape(1) == width && array.shape(2) == channels;
-  };
-  require(height > 0 && width > 0 && channels > 0 && fits(target) && (!gradient || fits(*gradient)) &&
-              (!weight || (weight->shape(0) == height && weight->shape(1) == width)),
-          "pictures do not have one shape");
-  nb::gil_scoped_release released;
-  return l1_ssim(picture.data(), target.data(), data_or_null(weight), static_cast<int>(height), static_cast<int>(width),
-                 static_cast<int>(channels), ssim_weight, threads, data_or_null(gradient));
-}
-
 }  // namespace
 
 NB_MODULE(_native, m) {
@@ -246,8 +191,7 @@ NB_MODULE(_native, m) {
         nb::arg("out").noconvert(), nb::arg("threads"));
   m.def("harmonics_backward", &harmonics_backward, nb::arg("gradient").noconvert(), nb::arg("directions").noconvert(),
         nb::arg("out").noconvert(), nb::arg("threads"));
-  m.def("l1_ssim", &picture_loss, nb::arg("picture").noconvert(), nb::arg("target").noconvert(),
-        nb::arg("weight").noconvert().none(), nb::arg("ssim_weight"), nb::arg("gradient").noconvert().none(),
-        nb::arg("threads"));
+  bind_loss(m);
+  bind_trainer(m);
   bind_floor(m);
 }

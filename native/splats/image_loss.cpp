@@ -30,51 +30,92 @@ Window ssim_window() {
   return window;
 }
 
+// Calls work(row, scratch) for all rows.
+template <class RowWork>
+void each_row(const PicturePair& pair, int threads, const RowWork& work) {
+  const size_t scratch_size = 6 * static_cast<size_t>(loss_line(pair.width, pair.channels));
+  parallel_for((pair.height + kRows - 1) / kRows, threads, [&](int task) {
+    const std::unique_ptr<float[]> scratch(new float[scratch_size]);
+    for (int row = task * kRows; row < std::min(pair.height, (task + 1) * kRows); ++row) work(row, scratch.get());
+  });
+}
+
+// Where pixels count as equal, a copy of the target with the picture in them; which rows see such pixels.
+void compose(PicturePair& pair, LossMemory& memory) {
+  const size_t pixels = static_cast<size_t>(pair.height) * pair.width, channels = pair.channels;
+  memory.is_composed.assign(pair.height, 0);
+  pair.is_composed = memory.is_composed.data();
+  if (pair.weight == nullptr || std::find(pair.weight, pair.weight + pixels, 0.0f) == pair.weight + pixels) return;
+  memory.composed.assign(pair.b, pair.b + pixels * channels);
+  for (int row = 0; row < pair.height; ++row) {
+    bool found = false;
+    const size_t start = static_cast<size_t>(row) * pair.width;
+    for (size_t pixel = start; pixel < start + pair.width; ++pixel) {
+      if (pair.weight[pixel] != 0.0f) continue;
+      found = true;
+      std::copy_n(pair.a + pixel * channels, channels, memory.composed.data() + pixel * channels);
+    }
+    if (!found) continue;
+    const int first = std::max(0, row - kSsimRadius), last = std::min(pair.height - 1, row + kSsimRadius);
+    std::fill(memory.is_composed.begin() + first, memory.is_composed.begin() + last + 1, uint8_t{1});
+  }
+  pair.b = memory.composed.data();
+}
+
+PicturePair pair_of(const float* picture, const LossTarget& target) {
+  static const Window window = ssim_window();
+  return {picture,     target.picture, target.weight, window.tap,      target.mean,
+          target.square, nullptr,        target.height, target.width, target.channels};
+}
+
 }  // namespace
 
-double l1_ssim(const float* picture, const float* target, const float* weight, int height, int width, int channels,
-               float ssim_weight, int threads, float* gradient) {
-  static const Window window = ssim_window();
+double l1_ssim(const float* picture, const LossTarget& target, float ssim_weight, int threads, float* gradient,
+               LossMemory& memory) {
   const Kernels& kernel = kernels();
-  const PicturePair pair = {picture, target, weight, window.tap, height, width, channels};
-  const size_t stride = loss_stride(width, channels), plane = height * stride;
-  const size_t scratch_size = 6 * static_cast<size_t>(loss_line(width, channels));
-  const int tasks = (height + kRows - 1) / kRows;
-  const std::unique_ptr<float[]> partial(new float[3 * plane]);
+  PicturePair pair = pair_of(picture, target);
+  compose(pair, memory);
+  const bool with_ssim = ssim_weight != 0.0f;
+  const size_t stride = loss_stride(pair.width, pair.channels), plane = pair.height * stride;
+  if (with_ssim) memory.partial.resize(3 * plane);
+  float* const partial = memory.partial.data();
 
-  std::vector<LossSums> sums(height);
-  parallel_for(tasks, threads, [&](int task) {
-    const std::unique_ptr<float[]> scratch(new float[scratch_size]);
-    for (int row = task * kRows; row < std::min(height, (task + 1) * kRows); ++row) {
-      float* const line = partial.get() + row * stride;
-      float* const out[3] = {line, line + plane, line + 2 * plane};
-      sums[row] = kernel.ssim_row(pair, row, out, scratch.get());
-    }
+  std::vector<LossSums> sums(pair.height);
+  each_row(pair, threads, [&](int row, float* scratch) {
+    float* const line = partial + row * stride;
+    float* const out[3] = {line, line + plane, line + 2 * plane};
+    sums[row] = with_ssim ? kernel.ssim_row(pair, row, out, scratch) : kernel.l1_row(pair, row, out, scratch);
   });
 
-  double total_weight = static_cast<double>(height) * width;
-  if (weight != nullptr) {
+  double total_weight = static_cast<double>(pair.height) * pair.width;
+  if (pair.weight != nullptr) {
     total_weight = 0.0;
-    for (size_t at = 0; at < static_cast<size_t>(height) * width; ++at) total_weight += weight[at];
+    for (size_t at = 0; at < static_cast<size_t>(pair.height) * pair.width; ++at) total_weight += pair.weight[at];
   }
-  const double scale = 1.0 / (total_weight * channels);
+  const double scale = 1.0 / (total_weight * pair.channels);
   double ssim = 0.0, l1 = 0.0;
   for (const LossSums& row : sums) {
     ssim += row.ssim;
     l1 += row.l1;
   }
   if (gradient != nullptr) {
-    const float* const in[3] = {partial.get(), partial.get() + plane, partial.get() + 2 * plane};
+    const float* const in[3] = {partial, partial + plane, partial + 2 * plane};
     const float l1_scale = static_cast<float>((1.0 - ssim_weight) * scale);
     const float ssim_scale = static_cast<float>(-ssim_weight * scale);
-    parallel_for(tasks, threads, [&](int task) {
-      const std::unique_ptr<float[]> scratch(new float[scratch_size]);
-      for (int row = task * kRows; row < std::min(height, (task + 1) * kRows); ++row) {
-        kernel.ssim_gradient_row(pair, row, in, l1_scale, ssim_scale, gradient, scratch.get());
-      }
+    const auto gradient_row = with_ssim ? kernel.ssim_gradient_row : kernel.l1_gradient_row;
+    each_row(pair, threads, [&](int row, float* scratch) {
+      gradient_row(pair, row, in, l1_scale, ssim_scale, gradient, scratch);
     });
   }
   return (1.0 - ssim_weight) * l1 * scale + ssim_weight * (1.0 - ssim * scale);
+}
+
+void target_statistics(const LossTarget& target, int threads, float* mean, float* square) {
+  const PicturePair pair = pair_of(target.picture, target);
+  const size_t stride = loss_stride(pair.width, pair.channels);
+  each_row(pair, threads, [&](int row, float* scratch) {
+    kernels().target_row(pair, row, mean + row * stride, square + row * stride, scratch);
+  });
 }
 
 }  // namespace rf3dgs

@@ -7,6 +7,7 @@
 #include <cstdint>
 
 #include "splats/constants.hpp"
+#include "splats/training_kernels.hpp"
 
 namespace rf3dgs {
 
@@ -126,12 +127,16 @@ struct ShapeKernels {
 
 constexpr int kReachGroup = 16;
 
-// Two pictures [row, col, channel] to be compared, with an optional weight [row, col].
+// Two pictures [row, col, channel] to be compared, with an optional weight [row, col]. The blurred b and bb [row,
+// loss_stride] may be known; they are not used in rows that see a pixel in which b was changed.
 struct PicturePair {
   const float* a;
   const float* b;
   const float* weight;
   const float* window;  // [kSsimTaps]
+  const float* mean;
+  const float* square;
+  const uint8_t* is_composed;  // [row]
   int height, width, channels;
 };
 
@@ -159,6 +164,13 @@ struct Kernels {
   LossSums (*ssim_row)(const PicturePair&, int row, float* const partial[3], float* scratch);
   void (*ssim_gradient_row)(const PicturePair&, int row, const float* const partial[3], float l1_scale,
                             float ssim_scale, float* gradient, float* scratch);
+  // The same two without similarity.
+  LossSums (*l1_row)(const PicturePair&, int row, float* const partial[3], float* scratch);
+  void (*l1_gradient_row)(const PicturePair&, int row, const float* const partial[3], float l1_scale,
+                          float ssim_scale, float* gradient, float* scratch);
+  // The blurred b and bb of a row.
+  void (*target_row)(const PicturePair&, int row, float* mean, float* square, float* scratch);
+  TrainingKernels training;
 };
 
 const Kernels& portable_kernels();

@@ -13,33 +13,39 @@ using namespace rf3dgs;
 
 typedef float Four __attribute__((vector_size(16)));
 
+// The basis at sixteen unit vectors.
+RF_INLINE void basis_at(Vec x, Vec y, Vec z, int bases, Vec* out) {
+  out[0] = splat_vec(0.28209479177387814f);
+  if (bases < 4) return;
+  out[1] = -0.4886025119029199f * y;
+  out[2] = 0.4886025119029199f * z;
+  out[3] = -0.4886025119029199f * x;
+  if (bases < 9) return;
+  const Vec xx = x * x, yy = y * y, zz = z * z;
+  out[4] = 1.0925484305920792f * x * y;
+  out[5] = -1.0925484305920792f * y * z;
+  out[6] = 0.31539156525252005f * (2.0f * zz - xx - yy);
+  out[7] = -1.0925484305920792f * x * z;
+  out[8] = 0.5462742152960396f * (xx - yy);
+  if (bases < 16) return;
+  out[9] = -0.5900435899266435f * y * (3.0f * xx - yy);
+  out[10] = 2.890611442640554f * x * y * z;
+  out[11] = -0.4570457994644658f * y * (4.0f * zz - xx - yy);
+  out[12] = 0.3731763325901154f * z * (2.0f * zz - 3.0f * xx - 3.0f * yy);
+  out[13] = -0.4570457994644658f * x * (4.0f * zz - xx - yy);
+  out[14] = 1.445305721320277f * z * (xx - yy);
+  out[15] = -0.5900435899266435f * x * (xx - 3.0f * yy);
+}
+
 // `out` is [bases, lane] for the directions [begin, begin + lanes).
 RF_INLINE void basis_of(const float* directions, size_t begin, int lanes, int bases, float (*out)[kLanes]) {
   alignas(64) float part[3][kLanes] = {};
   for (int lane = 0; lane < lanes; ++lane) {
     for (int axis = 0; axis < 3; ++axis) part[axis][lane] = directions[3 * (begin + lane) + axis];
   }
-  const Vec x = load(part[0]), y = load(part[1]), z = load(part[2]);
-  store(out[0], splat_vec(0.28209479177387814f));
-  if (bases < 4) return;
-  store(out[1], -0.4886025119029199f * y);
-  store(out[2], 0.4886025119029199f * z);
-  store(out[3], -0.4886025119029199f * x);
-  if (bases < 9) return;
-  const Vec xx = x * x, yy = y * y, zz = z * z;
-  store(out[4], 1.0925484305920792f * x * y);
-  store(out[5], -1.0925484305920792f * y * z);
-  store(out[6], 0.31539156525252005f * (2.0f * zz - xx - yy));
-  store(out[7], -1.0925484305920792f * x * z);
-  store(out[8], 0.5462742152960396f * (xx - yy));
-  if (bases < 16) return;
-  store(out[9], -0.5900435899266435f * y * (3.0f * xx - yy));
-  store(out[10], 2.890611442640554f * x * y * z);
-  store(out[11], -0.4570457994644658f * y * (4.0f * zz - xx - yy));
-  store(out[12], 0.3731763325901154f * z * (2.0f * zz - 3.0f * xx - 3.0f * yy));
-  store(out[13], -0.4570457994644658f * x * (4.0f * zz - xx - yy));
-  store(out[14], 1.445305721320277f * z * (xx - yy));
-  store(out[15], -0.5900435899266435f * x * (xx - 3.0f * yy));
+  Vec basis[16];
+  basis_at(load(part[0]), load(part[1]), load(part[2]), bases, basis);
+  for (int k = 0; k < bases; ++k) store(out[k], basis[k]);
 }
 
 // The first C of four floats; the others are read and written only where there is something behind them.

@@ -4,7 +4,8 @@
 //
 // G is its own adjoint, so the gradient is G*(S_m) + 2 a G*(S_aa) + b G*(S_ab). Wang et al. (2004).
 // A row of all channels is one line of floats in which the window's taps lie `channels` floats apart, so pictures are
-// read as they are. Columns are blurred first: the five products of a row then live in the nearest cache only.
+// read as they are. Columns are blurred first: the products of a row then live in the nearest cache only. What depends
+// on the second picture alone, G * b and G * bb, may be known already.
 #pragma once
 
 #include "core/vector.hpp"
@@ -70,36 +71,78 @@ RF_INLINE Vec blur_along_row(const PicturePair& pair, const float* at) {
   return sum;
 }
 
+// The rows of the window that lie in the picture.
+struct Taps {
+  int first, last;
+  RF_INLINE Taps(const PicturePair& pair, int row)
+      : first(row < kSsimRadius ? kSsimRadius - row : 0),
+        last(row + kSsimRadius < pair.height ? kSsimTaps : pair.height - row + kSsimRadius) {}
+};
+
+// Columns of b and bb, blurred.
+RF_INLINE void blur_target_columns(const PicturePair& pair, const Taps& taps, int row, int x, float* to_b, float* to_bb) {
+  const Strip strip(pair.b, row + taps.first - kSsimRadius, taps.last - taps.first, pair.width * pair.channels, x);
+  Vec b = {}, bb = {};
+  for (int tap = taps.first; tap < taps.last; ++tap) {
+    const Vec from = strip[tap - taps.first], part = pair.window[tap] * from;
+    b += part;
+    bb += part * from;
+  }
+  store(to_b, b);
+  store(to_bb, bb);
+}
+
+void target_row(const PicturePair& pair, int row, float* mean, float* square, float* scratch) {
+  const int length = pair.width * pair.channels;
+  const Lines lines = zero_sided_lines(pair, 2, scratch);
+  const Taps taps(pair, row);
+  for (int x = 0; x < length; x += kLanes) blur_target_columns(pair, taps, row, x, lines[0] + x, lines[1] + x);
+  for (int x = 0; x < length; x += kLanes) {
+    store(mean + x, blur_along_row(pair, lines[0] + x));
+    store(square + x, blur_along_row(pair, lines[1] + x));
+  }
+}
+
+LossSums l1_row(const PicturePair& pair, int row, float* const[3], float* scratch) {
+  const int length = pair.width * pair.channels;
+  const Lines lines = zero_sided_lines(pair, 1, scratch);
+  write_shares(pair, row, lines[0]);
+  Vec l1 = {};
+  for (int x = 0; x < length; x += kLanes) {
+    const Vec difference = Strip(pair.a, row, 1, length, x)[0] - Strip(pair.b, row, 1, length, x)[0];
+    l1 += load(lines[0] + x) * max_vec(difference, 0.0f - difference);
+  }
+  return {0.0f, sum_of(l1)};
+}
+
 LossSums ssim_row(const PicturePair& pair, int row, float* const partial[3], float* scratch) {
   const int length = pair.width * pair.channels;
-  const int first = row < kSsimRadius ? kSsimRadius - row : 0;
-  const int last = row + kSsimRadius < pair.height ? kSsimTaps : pair.height - row + kSsimRadius;
+  const Taps taps(pair, row);
   const Lines lines = zero_sided_lines(pair, 6, scratch);
   write_shares(pair, row, lines[5]);
+  const bool known = pair.mean != nullptr && !pair.is_composed[row];
+  const size_t place = static_cast<size_t>(row) * loss_stride(pair.width, pair.channels);
   for (int x = 0; x < length; x += kLanes) {
-    const Strip strip_a(pair.a, row + first - kSsimRadius, last - first, length, x);
-    const Strip strip_b(pair.b, row + first - kSsimRadius, last - first, length, x);
-    Vec a = {}, b = {}, aa = {}, bb = {}, ab = {};
-    for (int tap = first; tap < last; ++tap) {
-      const Vec from_a = strip_a[tap - first], from_b = strip_b[tap - first];
-      const Vec part_a = pair.window[tap] * from_a, part_b = pair.window[tap] * from_b;
+    const Strip strip_a(pair.a, row + taps.first - kSsimRadius, taps.last - taps.first, length, x);
+    const Strip strip_b(pair.b, row + taps.first - kSsimRadius, taps.last - taps.first, length, x);
+    Vec a = {}, aa = {}, ab = {};
+    for (int tap = taps.first; tap < taps.last; ++tap) {
+      const Vec from_a = strip_a[tap - taps.first], part_a = pair.window[tap] * from_a;
       a += part_a;
-      b += part_b;
       aa += part_a * from_a;
-      bb += part_b * from_b;
-      ab += part_a * from_b;
+      ab += part_a * strip_b[tap - taps.first];
     }
     store(lines[0] + x, a);
-    store(lines[1] + x, b);
     store(lines[2] + x, aa);
-    store(lines[3] + x, bb);
     store(lines[4] + x, ab);
+    if (!known) blur_target_columns(pair, taps, row, x, lines[1] + x, lines[3] + x);
   }
   Vec ssim = {}, l1 = {};
   for (int x = 0; x < length; x += kLanes) {
-    const Vec ma = blur_along_row(pair, lines[0] + x), mb = blur_along_row(pair, lines[1] + x);
-    const Vec aa = blur_along_row(pair, lines[2] + x), bb = blur_along_row(pair, lines[3] + x);
+    const Vec ma = blur_along_row(pair, lines[0] + x), aa = blur_along_row(pair, lines[2] + x);
     const Vec ab = blur_along_row(pair, lines[4] + x), share = load(lines[5] + x);
+    const Vec mb = known ? load(pair.mean + place + x) : blur_along_row(pair, lines[1] + x);
+    const Vec bb = known ? load(pair.square + place + x) : blur_along_row(pair, lines[3] + x);
     const Vec a1 = 2.0f * ma * mb + kSsimC1, a2 = 2.0f * (ab - ma * mb) + kSsimC2;
     const Vec b1 = ma * ma + mb * mb + kSsimC1, b2 = (aa - ma * ma) + (bb - mb * mb) + kSsimC2;
     const Vec inverse = 1.0f / (b1 * b2);
@@ -114,18 +157,41 @@ LossSums ssim_row(const PicturePair& pair, int row, float* const partial[3], flo
   return {sum_of(ssim), sum_of(l1)};
 }
 
+// Share times the sign of a - b, scaled, and what `along` says.
+RF_INLINE void write_gradient(const PicturePair& pair, int row, int x, Vec share, float l1_scale, Vec along, float* gradient) {
+  const int length = pair.width * pair.channels;
+  const Vec a = Strip(pair.a, row, 1, length, x)[0], b = Strip(pair.b, row, 1, length, x)[0];
+  const Vec one = splat_vec(l1_scale);
+  const Vec sign = select(a > b, one, select(a < b, 0.0f - one, Vec{}));
+  const Vec result = share * sign + along;
+  float* to = gradient + static_cast<size_t>(row) * length + x;
+  if (length - x >= kLanes) {
+    store(to, result);
+  } else {
+    for (int lane = 0; lane < length - x; ++lane) to[lane] = result[lane];
+  }
+}
+
+void l1_gradient_row(const PicturePair& pair, int row, const float* const[3], float l1_scale, float, float* gradient,
+                     float* scratch) {
+  const Lines lines = zero_sided_lines(pair, 1, scratch);
+  write_shares(pair, row, lines[0]);
+  for (int x = 0; x < pair.width * pair.channels; x += kLanes) {
+    write_gradient(pair, row, x, load(lines[0] + x), l1_scale, Vec{}, gradient);
+  }
+}
+
 void ssim_gradient_row(const PicturePair& pair, int row, const float* const partial[3], float l1_scale,
                        float ssim_scale, float* gradient, float* scratch) {
   const int length = pair.width * pair.channels, stride = loss_stride(pair.width, pair.channels);
-  const int first = row < kSsimRadius ? kSsimRadius - row : 0;
-  const int last = row + kSsimRadius < pair.height ? kSsimTaps : pair.height - row + kSsimRadius;
+  const Taps taps(pair, row);
   const Lines lines = zero_sided_lines(pair, 4, scratch);
   write_shares(pair, row, lines[3]);
   for (int x = 0; x < length; x += kLanes) {
     for (int map = 0; map < 3; ++map) {
-      const float* from = partial[map] + static_cast<size_t>(row + first - kSsimRadius) * stride + x;
+      const float* from = partial[map] + static_cast<size_t>(row + taps.first - kSsimRadius) * stride + x;
       Vec sum = {};
-      for (int tap = first; tap < last; ++tap, from += stride) sum += pair.window[tap] * load(from);
+      for (int tap = taps.first; tap < taps.last; ++tap, from += stride) sum += pair.window[tap] * load(from);
       store(lines[map] + x, sum);
     }
   }
@@ -133,15 +199,7 @@ void ssim_gradient_row(const PicturePair& pair, int row, const float* const part
     const Vec a = Strip(pair.a, row, 1, length, x)[0], b = Strip(pair.b, row, 1, length, x)[0];
     const Vec along = blur_along_row(pair, lines[0] + x) + 2.0f * a * blur_along_row(pair, lines[1] + x) +
                       b * blur_along_row(pair, lines[2] + x);
-    const Vec one = splat_vec(l1_scale);
-    const Vec sign = select(a > b, one, select(a < b, 0.0f - one, Vec{}));
-    const Vec result = load(lines[3] + x) * sign + ssim_scale * along;
-    float* to = gradient + static_cast<size_t>(row) * length + x;
-    if (length - x >= kLanes) {
-      store(to, result);
-    } else {
-      for (int lane = 0; lane < length - x; ++lane) to[lane] = result[lane];
-    }
+    write_gradient(pair, row, x, load(lines[3] + x), l1_scale, ssim_scale * along, gradient);
   }
 }
 

@@ -4,7 +4,9 @@ import pytest
 import torch
 
 from rf3dgs.core.errors import InputError
+from rf3dgs.splats.backends.native import core
 from rf3dgs.splats.image_loss import l1_ssim, l1_ssim_reference, psnr, ssim
+from rf3dgs.splats.target import Target
 
 
 @pytest.mark.parametrize("shape", [(40, 50, 3), (33, 47, 1), (7, 3, 2), (1, 1, 4)])
@@ -70,3 +72,44 @@ def test_wrong_pictures_are_named():
         l1_ssim(torch.zeros(4, 4, 3), torch.zeros(4, 4, 3), weight=torch.zeros(4, 4))
     with pytest.raises(InputError, match="ssim_weight must lie between 0 and 1; got 2"):
         l1_ssim(torch.zeros(4, 4, 3), torch.zeros(4, 4, 3), ssim_weight=2.0)
+
+
+@pytest.mark.parametrize("shape", [(40, 50, 1), (33, 47, 3), (7, 3, 2)])
+@pytest.mark.parametrize("masked", [False, True])
+def test_known_statistics_of_the_target_change_no_bit(shape: tuple[int, int, int], masked: bool):
+    generator = torch.Generator().manual_seed(4)
+    picture, goal = torch.rand(shape, generator=generator), torch.rand(shape, generator=generator)
+    weight = torch.ones(shape[:2])
+    if masked:
+        weight[2:4, 1:3] = 0.0
+    target = Target(goal, weight)
+    results = []
+    for statistics in (None, target.statistics):
+        gradient = torch.empty_like(picture)
+        loss = core().l1_ssim(picture, goal, weight, 0.3, statistics, gradient, 2)
+        results.append((loss, gradient))
+    assert results[0][0] == results[1][0]
+    assert torch.equal(results[0][1], results[1][1])
+
+
+@pytest.mark.parametrize("ssim_weight", [0.0, 0.2])
+def test_masked_pixels_count_as_equal_in_the_windows_of_their_neighbours(ssim_weight: float):
+    generator = torch.Generator().manual_seed(5)
+    picture, target = torch.rand(30, 26, 2, generator=generator), torch.rand(30, 26, 2, generator=generator)
+    weight = torch.rand(30, 26, generator=generator) + 0.1
+    weight[8:12, 5:9] = 0.0
+    equal = torch.where((weight > 0)[..., None], target, picture)
+    other = torch.where((weight > 0)[..., None], target, 7.0)
+    results = []
+    for goal in (target, equal, other):
+        leaf = picture.clone().requires_grad_()
+        loss = l1_ssim(leaf, goal, weight=weight, ssim_weight=ssim_weight)
+        loss.backward()
+        results.append((loss.item(), leaf.grad))
+    precise = picture.double().requires_grad_()
+    exact = l1_ssim_reference(precise, target.double(), weight=weight.double(), ssim_weight=ssim_weight)
+    exact.backward()
+    assert precise.grad is not None
+    for loss, gradient in results:
+        assert loss == pytest.approx(exact.item(), abs=1e-6)
+        assert (gradient - precise.grad).norm() <= 1e-5 * precise.grad.norm()

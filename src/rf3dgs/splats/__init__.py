@@ -18,8 +18,11 @@ if TYPE_CHECKING:
     from rf3dgs.splats.ply import write_ply as write_ply
     from rf3dgs.splats.raster import Raster as Raster
     from rf3dgs.splats.rasterize import pick_backend as pick_backend
+    from rf3dgs.splats.rates import Rates as Rates
     from rf3dgs.splats.reference import rasterize_reference as rasterize_reference
     from rf3dgs.splats.surface import sample_mesh as sample_mesh
+    from rf3dgs.splats.target import Target as Target
+    from rf3dgs.splats.trainer import Trainer as Trainer
     from rf3dgs.splats.transmittance import segment_transmittance as segment_transmittance
 
 __all__ = [  # noqa: RUF022
@@ -30,6 +33,9 @@ __all__ = [  # noqa: RUF022
     "l1_ssim",
     "ssim",
     "psnr",
+    "Trainer",
+    "Target",
+    "Rates",
     "DensityState",
     "sample_mesh",
     "segment_transmittance",
@@ -47,6 +53,9 @@ __getattr__, __dir__ = lazy_names(
         "l1_ssim": ".image_loss",
         "ssim": ".image_loss",
         "psnr": ".image_loss",
+        "Trainer": ".trainer",
+        "Target": ".target",
+        "Rates": ".rates",
         "DensityState": ".density",
         "sample_mesh": ".surface",
         "segment_transmittance": ".transmittance",

@@ -15,8 +15,9 @@ from rf3dgs.splats.constants import SSIM_C1, SSIM_C2, SSIM_RADIUS, SSIM_SIGMA
 def l1_ssim(picture: Tensor, target: Tensor, *, ssim_weight: float = 0.2, weight: Tensor | None = None) -> Tensor:
     """`(1 - ssim_weight) L1 + ssim_weight (1 - SSIM)` of pictures `[row, col, channel]`; differentiable in `picture`.
 
-    `weight` `[row, col]` (not negative) turns both means into weighted means. SSIM is computed with values in 0..1, a
-    window of 11x11 pixels and zeros outside the picture.
+    `weight` `[row, col]` (not negative) turns both means into weighted means; pixels of weight 0 count as equal in both
+    pictures, also in the windows of their neighbours. SSIM is computed with values in 0..1, a window of 11x11 pixels
+    and zeros outside the picture.
     """
     _check(picture, target, weight)
     if not 0.0 <= ssim_weight <= 1.0:
@@ -30,6 +31,8 @@ def l1_ssim_reference(
     picture: Tensor, target: Tensor, *, ssim_weight: float = 0.2, weight: Tensor | None = None
 ) -> Tensor:
     """`l1_ssim` in plain torch: the specification."""
+    if weight is not None:
+        target = torch.where((weight > 0)[..., None], target, picture.detach())
     l1 = _mean((picture - target).abs(), weight)
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - _mean(ssim_map(picture, target), weight))
 

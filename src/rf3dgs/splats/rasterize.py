@@ -69,7 +69,7 @@ def rasterize(
     if backend not in _BACKENDS:
         raise InputError(f"backend must be one of {', '.join(_BACKENDS)}; got {backend!r}")
     check_inputs(means, quats, scales, opacities, values, background, screen_offset)
-    _check_view(view, values, background, screen_offset, compositing, added)
+    check_view(view, values, background, screen_offset, compositing, added)
     name, reason = backend, "asked for by name"
     if backend == "auto":
         name, reason = pick_backend(means.device.type, means.dtype)
@@ -93,7 +93,7 @@ def rasterize(
     return Raster(finish(raster.values, raster.weight, compositing, added), raster.weight, raster.radii)
 
 
-def _check_view(
+def check_view(
     view: View,
     values: Tensor,
     background: Tensor | None,

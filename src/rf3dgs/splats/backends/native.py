@@ -144,7 +144,7 @@ class _L1Ssim(torch.autograd.Function):
     def forward(ctx: Any, picture: Tensor, target: Tensor, weight: Tensor | None, ssim_weight: float) -> Tensor:
         gradient = torch.empty_like(picture, memory_format=torch.contiguous_format) if picture.requires_grad else None
         share = None if weight is None else _plain(weight)
-        loss = core().l1_ssim(_plain(picture), _plain(target), share, ssim_weight, gradient, thread_count())
+        loss = core().l1_ssim(_plain(picture), _plain(target), share, ssim_weight, None, gradient, thread_count())
         ctx.gradient = gradient
         return torch.tensor(loss, dtype=torch.float32)
 
