@@ -138,13 +138,18 @@ def gain_values(gain_sh: Tensor, directions: Tensor) -> Tensor:
     return evaluate(gain_sh[..., None], directions, offset=0.5, clamp=True)
 
 
-def csi_prior(means: Tensor, tx: Tensor, centre: Tensor) -> Tensor:
-    """Delay [ns] and departure vector `[N, 4]` of the single bounce transmitter -> Gaussian -> receiver."""
+def bounce(means: Tensor, tx: Tensor) -> Tensor:
+    """Delay [ns] and departure vector `[N, 4]` of the way from the transmitter to a Gaussian."""
     outward = means - tx
     first = torch.linalg.vector_norm(outward, dim=-1, keepdim=True)
-    second = torch.linalg.vector_norm(means - centre, dim=-1, keepdim=True)
-    delay = (first + second) / (SPEED_OF_LIGHT * NANOSECOND)
-    return torch.cat((delay, outward / first.clamp_min(1e-6)), -1)
+    return torch.cat((first / (SPEED_OF_LIGHT * NANOSECOND), outward / first.clamp_min(1e-6)), -1)
+
+
+def csi_prior(means: Tensor, tx: Tensor, centre: Tensor) -> Tensor:
+    """Delay [ns] and departure vector `[N, 4]` of the single bounce transmitter -> Gaussian -> receiver."""
+    prior = bounce(means, tx)
+    prior[:, 0] += torch.linalg.vector_norm(means - centre, dim=-1) / (SPEED_OF_LIGHT * NANOSECOND)
+    return prior
 
 
 def csi_values(surface: Surface, centre: Tensor, directions: Tensor) -> Tensor:

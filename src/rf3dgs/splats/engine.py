@@ -92,7 +92,7 @@ class Engine(Protocol):
         ...
 
     def load(self, memory: Mapping[str, Tensor]) -> None:
-        """Go on from what `memory` was, perhaps of another number of Gaussians."""
+        """Go on from what of `memory` training changes, perhaps of another number of Gaussians if all is trained."""
         ...
 
     def beside(self, scheme: Scheme, sh: Tensor, base: Tensor | None, along: Tensor | None) -> "Engine":
@@ -114,6 +114,12 @@ def check_tensors(tensors: Mapping[str, Tensor], base: Tensor | None, along: Ten
     for name, tensor, size in (("base", base, (count, sh.shape[2])), ("along", along, (sh.shape[2],))):
         if tensor is not None and tensor.shape != size:
             raise InputError(f"{name} must be {list(size)}; got {list(tensor.shape)}")
+
+
+def check_whole(memory: Mapping[str, Tensor]) -> None:
+    """Raises InputError for a state of other Gaussians that lacks what was frozen there."""
+    if not memory.keys() >= set(PARAMETERS):
+        raise InputError("the state is of other Gaussians than the trainer's; make the trainer from the same geometry")
 
 
 def make_engine(

@@ -80,6 +80,11 @@ class Trainer:
     def __len__(self) -> int:
         return self._engine.count
 
+    @property
+    def channels(self) -> int:
+        """Of the harmonics."""
+        return self._sizes[1]
+
     def beside(
         self,
         sh: Tensor,
@@ -192,29 +197,33 @@ class Trainer:
         self._drawn = None
 
     def state(self) -> dict[str, Tensor]:
-        """All that training changes, by name, for a checkpoint. These are the trainer's own tensors, in its own order
-        and layout: further steps change them.
-        """
-        return {**self._engine.memory, "numbers": torch.tensor([self.steps, self.degree, *self._sizes])}
+        """All that training changes, by name, for a checkpoint: the trainer's tensors, which steps change."""
+        state = {name: self._engine.memory[name] for name in self._changing()}
+        if "order" in state:  # trainers beside each other share it, files want it twice
+            state["order"] = state["order"].clone()
+        return {**state, "numbers": torch.tensor([self.steps, self.degree, *self._sizes])}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Go on from a state, bit by bit. Raises InputError for one of another kind of training or backend."""
-        memory = {name: tensor for name, tensor in state.items() if name != "numbers"}
-        if "numbers" not in state or memory.keys() != self._engine.memory.keys():
+        if state.keys() != {*self._changing(), "numbers"}:
             raise InputError("the state must come from a trainer of the same tensors and backend; it has other names")
-        self._engine.load(memory)
+        self._engine.load({name: tensor for name, tensor in state.items() if name != "numbers"})
         self.steps, self.degree = (int(number) for number in state["numbers"][:2])
         self._drawn = None
 
     @classmethod
     def resume(cls, state: Mapping[str, Tensor], **options: Any) -> "Trainer":
-        """A trainer from a state alone; `options` as when it was made."""
+        """A trainer from a state alone, where everything is trained; `options` as when it was made."""
         coefficients, channels = (int(number) for number in state["numbers"][2:])
-        shapes = {"means": (1, 3), "quats": (1, 4), "log_scales": (1, 3), "logit_opacities": (1,)}
-        one = {name: torch.zeros(shape) for name, shape in shapes.items()}
-        trainer = cls(**one, sh=torch.zeros(1, coefficients, channels), **options)
+        one = torch.zeros(1, 3), torch.zeros(1, 4), torch.zeros(1, 3), torch.zeros(1)
+        trainer = cls(*one, torch.zeros(1, coefficients, channels), **options)
         trainer.restore(state)
         return trainer
+
+    def _changing(self) -> list[str]:
+        """The names of what training changes, and of the order it lies in."""
+        frozen = set(FIELDS) - set(self._scheme.trained)
+        return [name for name in self._engine.memory if name not in frozen]
 
     def _moments(self, *names: str) -> list[str]:
         return [f"{moment}.{name}" for name in names if name in self._scheme.trained for moment in ("first", "second")]

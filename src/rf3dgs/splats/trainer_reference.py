@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rf3dgs.core.grids import Camera
 from rf3dgs.splats.density import DensityState
-from rf3dgs.splats.engine import PARAMETERS, Look, Scheme
+from rf3dgs.splats.engine import PARAMETERS, Look, Scheme, check_whole
 from rf3dgs.splats.harmonics import evaluate, view_directions
 from rf3dgs.splats.image_loss import l1_ssim
 from rf3dgs.splats.raster import Raster
@@ -155,10 +155,11 @@ class TorchEngine:
 
     def load(self, memory: Mapping[str, Tensor]) -> None:
         """In place where the number of Gaussians is the same, so that engines beside this one see it."""
-        if len(memory["means"]) == self.count:
-            for name, tensor in self.memory.items():
-                tensor.copy_(memory[name])
+        if len(memory["sh"]) == self.count:
+            for name, tensor in memory.items():
+                self.memory[name].copy_(tensor)
         else:
+            check_whole(memory)
             self.memory = {name: memory[name].clone() for name in self.memory}
             self.count = len(self.memory["means"])
 

@@ -6,142 +6,124 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from rf3dgs.field.radiance import Surface, csi_values, gain_values, in_view, reach_of
-from rf3dgs.splats.harmonics import C0, view_directions
-from rf3dgs.splats.image_loss import l1_ssim
-from rf3dgs.splats.rasterize import rasterize
-from rf3dgs.training.adam import Adam
+from rf3dgs.core.units import SPEED_OF_LIGHT
+from rf3dgs.field.radiance import NANOSECOND, Surface, bounce, in_view, reach_of
+from rf3dgs.splats.compositing import Compositing
+from rf3dgs.splats.harmonics import C0
+from rf3dgs.splats.rates import Rates
+from rf3dgs.splats.target import Target
+from rf3dgs.splats.trainer import Trainer
 from rf3dgs.training.backprojection import ridge_start
 from rf3dgs.training.checkpoint import State
 from rf3dgs.training.config import RadioConfig
 from rf3dgs.training.loop import view_at
 from rf3dgs.training.radio_views import RadioView
 
-DELAY_SCALE_NS = 10.0
+CSI_UNITS = torch.tensor([10.0, 1.0, 1.0, 1.0])
+"""An error of so many nanoseconds of delay weighs as much as one of 1 in a component of the departure."""
 START_DEGREE = 2
+MEANS = Compositing(normalise=True)
 
 
 class RadioStage:
-    """What the loop drives: parameters of the surface, their optimiser, and the views."""
+    """What the loop drives: a trainer of gain and opacity, one of delay and departure beside it, and the views.
+
+    In the paper's encoding all channels are one picture of the first trainer.
+    """
 
     def __init__(self, bare: Surface, views: Sequence[RadioView], config: RadioConfig) -> None:
         self.bare, self.views, self.config = bare, views, config
-        reach = reach_of(bare.scales)
-        self.visible = [in_view(bare.means, reach, view.camera) for view in views]
         self.has_csi = all(view.csi is not None for view in views)
-        gain_sh, csi_sh = self._start()
-        values = {
-            "level": gain_sh[:, :1],
-            "harmonics": gain_sh[:, 1:],
-            "opacity": bare.logit_opacities.clamp(-6.0, 6.0),
-            "csi": csi_sh,
-        }
-        self.parameters = {name: value.clone().contiguous().requires_grad_() for name, value in values.items()}
-        self.parameters["opacity"].requires_grad_(config.train_opacity)
-        self.optimiser = Adam(self.parameters)
+        self.is_paper = config.encoding == "paper"
+        gain_sh, self.csi_sh = self._start()
+        sh = gain_sh[..., None]
+        if self.is_paper and self.has_csi:
+            sh = torch.cat((sh, self.csi_sh), -1)
+        opacity = bare.logit_opacities.clamp(-6.0, 6.0)
+        train = ("opacity", "sh") if config.train_opacity else ("sh",)
+        shape = (bare.means, bare.quats, bare.log_scales, opacity)
+        self.gain = Trainer(*shape, sh, train=train, backend=config.backend)
+        self.targets = [self._target(view) for view in views]
+        self.csi: Trainer | None = None
+        if self.has_csi and not self.is_paper and config.csi_every > 0:
+            base, along = bounce(bare.means, bare.tx), torch.zeros(4)
+            along[0] = 1 / (SPEED_OF_LIGHT * NANOSECOND)
+            options = {"offset": 0.0, "clamp": False, "base": base / CSI_UNITS, "along": along / CSI_UNITS}
+            self.csi = self.gain.beside(self.csi_sh / CSI_UNITS, **options)
+        self.csi_targets = [_csi_target(view) for view in views] if self.csi is not None else []
 
     def step(self, iteration: int) -> float:
         """One view: its gain, and in every n-th iteration its delay and departure."""
-        number = view_at(self.config.seed, iteration, len(self.views))
-        view, surface = self.views[number], self._surface().select(self.visible[number])
-        directions = view_directions(surface.means, view.camera.position)
-        if self.config.encoding == "paper":
-            loss = self._paper_loss(surface, view, directions)
-        else:
-            loss = self._gain_loss(surface, view, directions)
-            every = self.config.csi_every
-            if self.has_csi and every > 0 and iteration % every == 0:
-                loss = loss + self._csi_loss(surface, view, directions)
-        if self.config.shrink > 0:
-            loss = loss + self.config.shrink * surface.gain_sh[:, 1:].square().mean()
-        loss.backward()
-        fall = self.config.lr_final ** (iteration / max(1, self.config.steps))
-        rates = {
-            "level": self.config.lr_level / C0 * fall,
-            "harmonics": self.config.lr_harmonics / C0 * fall,
-            "opacity": self.config.lr_opacity * fall,
-            "csi": self.config.lr_csi / C0 * fall,
-        }
-        self.optimiser.step(rates)
-        return float(loss.detach())
+        config = self.config
+        number = view_at(config.seed, iteration, len(self.views))
+        camera = self.views[number].camera
+        fall = config.lr_final ** (iteration / max(1, config.steps))
+        level, bands, csi = (rate / C0 * fall for rate in (config.lr_level, config.lr_harmonics, config.lr_csi))
+        others = self.gain.channels - 1
+        rates = Rates(
+            logit_opacities=config.lr_opacity * fall,
+            level=(level, *[csi] * others),
+            bands=(bands, *[csi] * others),
+        )
+        loss = self.gain.step(camera, self.targets[number], rates, ssim_weight=config.ssim_weight, shrink=config.shrink)
+        if self.csi is not None and iteration % config.csi_every == 0:
+            target = self.csi_targets[number]
+            if target is not None:
+                each = tuple((csi / CSI_UNITS).tolist())
+                rates = Rates(level=each, bands=each)
+                error = self.csi.step(camera, target, rates, ssim_weight=0.0, compositing=MEANS)
+                loss += self.csi.channels * error
+        return loss
 
     def state(self) -> State:
         """Parameters and moments."""
-        tensors = {name: value.detach() for name, value in self.parameters.items()}
-        tensors |= {f"first.{name}": value for name, value in self.optimiser.first.items()}
-        tensors |= {f"second.{name}": value for name, value in self.optimiser.second.items()}
-        return State(tensors, {"count": self.optimiser.count})
+        tensors = {f"gain.{name}": tensor for name, tensor in self.gain.state().items()}
+        if self.csi is not None:
+            tensors |= {f"csi.{name}": tensor for name, tensor in self.csi.state().items()}
+        return State(tensors, {})
 
     def restore(self, state: State) -> None:
         """Go on from a state."""
-        with torch.no_grad():
-            for name, value in self.parameters.items():
-                value.copy_(state.tensors[name])
-                self.optimiser.first[name].copy_(state.tensors[f"first.{name}"])
-                self.optimiser.second[name].copy_(state.tensors[f"second.{name}"])
-        self.optimiser.count = int(str(state.numbers["count"]))
+        for prefix, trainer in (("gain.", self.gain), ("csi.", self.csi)):
+            if trainer is not None:
+                own = {name: value for name, value in state.tensors.items() if name.startswith(prefix)}
+                trainer.restore({name.removeprefix(prefix): value for name, value in own.items()})
 
     def surface(self) -> Surface:
-        """A copy of the surface as it is now, outside any graph; further steps do not change it."""
-        current = self._surface()
-        trained = ("logit_opacities", "gain_sh", "csi_sh")
-        return replace(current, **{name: getattr(current, name).detach().clone() for name in trained})
-
-    def _surface(self) -> Surface:
-        bare, own = self.bare, self.parameters
-        gain_sh = torch.cat((own["level"], own["harmonics"]), 1)
-        shape = (bare.means, bare.quats, bare.log_scales, own["opacity"], gain_sh, own["csi"])
-        return Surface(*shape, bare.tx, bare.window, bare.encoding, bare.delay_span)
+        """A copy of the surface as it is now; further steps do not change it."""
+        trained = self.gain.tensors()
+        gain_sh, csi_sh = trained["sh"][..., 0].contiguous(), self.csi_sh
+        if self.is_paper and self.has_csi:
+            csi_sh = trained["sh"][..., 1:].contiguous()
+        elif self.csi is not None:
+            csi_sh = self.csi.tensors()["sh"] * CSI_UNITS
+        return replace(self.bare, logit_opacities=trained["logit_opacities"], gain_sh=gain_sh, csi_sh=csi_sh)
 
     def _start(self) -> tuple[Tensor, Tensor]:
         config, bare = self.config, self.bare
         if config.start == "grey":
             return bare.gain_sh, bare.csi_sh
         degree = min(config.degree, START_DEGREE) if config.start == "ridge" else 0
+        reach = reach_of(bare.scales)
+        visible = [in_view(bare.means, reach, view.camera) for view in self.views]
         with torch.enable_grad():
             found, csi = ridge_start(
-                bare, self.views, self.visible, degree=degree, ridge=config.ridge, backend=config.backend
+                bare, self.views, visible, degree=degree, ridge=config.ridge, backend=config.backend
             )
         gain_sh = torch.zeros_like(bare.gain_sh)
         gain_sh[:, : found.shape[1]] = found
         return gain_sh, csi
 
-    def _gain_loss(self, surface: Surface, view: RadioView, directions: Tensor) -> Tensor:
-        values = gain_values(surface.gain_sh, directions)
-        picture = self._raster(surface, values, view, surface.opacities)[0]
-        target = torch.where((view.keep > 0)[..., None], view.gain[..., None], picture.detach())
-        return l1_ssim(picture, target, ssim_weight=self.config.ssim_weight, weight=view.keep)
+    def _target(self, view: RadioView) -> Target:
+        """Gain, and in the paper's encoding its other channels; pixels that a point source rules do not count."""
+        picture = view.gain[..., None]
+        if self.is_paper and view.csi is not None and self.has_csi:
+            picture = torch.cat((picture, view.csi), -1)
+        return Target(picture, view.keep)
 
-    def _csi_loss(self, surface: Surface, view: RadioView, directions: Tensor) -> Tensor:
-        """L1 of delay and departure, weighted by what a path reaches: solid angle times gain in the window."""
-        assert view.csi is not None
-        values = csi_values(surface, view.camera.position, directions)
-        blended, weight = self._raster(surface, values, view, surface.opacities.detach())
-        picture = blended / weight.detach().clamp_min(1e-3)[..., None]
-        reached = view.keep * view.gain * (weight.detach() > 1e-3)
-        late, turned = (picture - view.csi).abs().split((1, 3), -1)
-        error = late.squeeze(-1) / DELAY_SCALE_NS + turned.sum(-1)
-        return (reached * error).sum() / reached.sum().clamp_min(1e-6)
 
-    def _paper_loss(self, surface: Surface, view: RadioView, directions: Tensor) -> Tensor:
-        """The paper's channels all in one picture, every one through the opacities."""
-        values = gain_values(surface.gain_sh, directions)
-        target = view.gain[..., None]
-        if view.csi is not None:
-            values = torch.cat((values, csi_values(surface, view.camera.position, directions)), -1)
-            target = torch.cat((target, view.csi), -1)
-        picture = self._raster(surface, values, view, surface.opacities)[0]
-        target = torch.where((view.keep > 0)[..., None], target, picture.detach())
-        return l1_ssim(picture, target, ssim_weight=self.config.ssim_weight, weight=view.keep)
-
-    def _raster(self, surface: Surface, values: Tensor, view: RadioView, opacities: Tensor) -> tuple[Tensor, Tensor]:
-        raster = rasterize(
-            surface.means,
-            surface.quats,
-            surface.scales,
-            opacities,
-            values,
-            view.camera,
-            backend=self.config.backend,
-        )
-        return raster.values, raster.weight
+def _csi_target(view: RadioView) -> Target | None:
+    """Delay and departure, weighted by what a path reaches: solid angle times gain in the window."""
+    assert view.csi is not None
+    weight = view.keep * view.gain
+    return Target(view.csi / CSI_UNITS, weight) if float(weight.sum()) > 0 else None

@@ -9,7 +9,7 @@ from torch import Tensor
 from rf3dgs.core.grids import Camera, View
 from rf3dgs.splats.backends.core import thread_count
 from rf3dgs.splats.backends.native import core
-from rf3dgs.splats.engine import Look, Scheme
+from rf3dgs.splats.engine import Look, Scheme, check_whole
 from rf3dgs.splats.raster import Raster
 from rf3dgs.splats.rates import Rates
 from rf3dgs.splats.target import Target
@@ -90,9 +90,10 @@ class NativeEngine:
     def load(self, memory: Mapping[str, Tensor]) -> None:
         """In place where order and number of Gaussians are the same, so that engines beside this one see it."""
         if torch.equal(memory["order"], self.memory["order"]):
-            for name, tensor in self.memory.items():
-                tensor.copy_(memory[name])
+            for name, tensor in memory.items():
+                self.memory[name].copy_(tensor)
         else:
+            check_whole(memory)
             self.memory = {name: memory[name].clone() for name in self.memory}
             self.count = len(self.memory["means"])
             self._activated = {"scales": torch.empty(self.count, 3), "opacities": torch.empty(self.count)}
