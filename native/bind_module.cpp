@@ -172,7 +172,7 @@ NB_MODULE(_native, m) {
   nb::class_<Scene>(m, "Scene", "What the backward pass needs of a forward pass.")
       .def_prop_ro("visible", [](const Scene& scene) { return scene.visible; })
       .def_prop_ro("entries", [](const Scene& scene) { return scene.entries; })
-      .def_prop_ro("pairs", [](const Scene& scene) { return scene.pairs; });
+      .def_prop_ro("pairs", [](const Scene& scene) { return scene.pairs(); });
 
   m.def("rasterize", &forward, nb::arg("means").noconvert(), nb::arg("quats").noconvert(),
         nb::arg("scales").noconvert(), nb::arg("opacities").noconvert(), nb::arg("values").noconvert(),

@@ -8,6 +8,7 @@ constexpr float kNear = 0.05f;                // m: Gaussians nearer than this v
 constexpr float kBlur = 0.3f;                 // pixel^2 added to both variances of a projected Gaussian
 constexpr float kAlphaMax = 0.99f;            // no Gaussian hides more of what lies behind it
 constexpr float kAlphaMin = 1.0f / 255.0f;    // weaker contributions to a pixel are skipped
+constexpr float kLog2AlphaMin = -7.994353436858858f;
 constexpr float kTransmittanceStop = 1e-4f;   // a pixel stops before the contribution that would bring it below
 constexpr float kFieldClamp = 1.3f;           // the Jacobian's x/z and y/z stay within this many half-fields
 constexpr float kMinQuaternionNorm = 1e-12f;  // shorter quaternions have no direction

@@ -13,6 +13,7 @@ namespace rf3dgs {
 
 enum class Kind { pinhole, sphere };
 constexpr int kKinds = 2;
+constexpr int kMostGeometrySums = 9;  // of any shape
 
 // camera_from_world (row-major rotation, translation) and the picture's size; for a pinhole also focal lengths and
 // centre in pixels and the limits of x/z and y/z in the Jacobian.
@@ -51,7 +52,7 @@ struct Projected {
 
 // A tile that a splat reaches, with the bits of its 4x4 pixel blocks.
 struct Found {
-  uint32_t tile, splat, blocks;
+  uint32_t tile, blocks, splat;
   float depth;
 };
 
@@ -103,8 +104,8 @@ struct Slopes {
   float* rows;
 };
 
-// Floats of an entry's row of gradients: of a chunk of values, of ln alpha, and geometry sums.
-constexpr int gradient_row(int chunk, int geometry_sums) { return chunk + 1 + geometry_sums; }
+// Floats of an entry's row of gradients: of a chunk of values, of ln alpha, and geometry sums, rounded up to whole fours.
+constexpr int gradient_row(int chunk, int geometry_sums) { return (chunk + 1 + geometry_sums + 3) / 4 * 4; }
 
 // What depends on the kind of view. A shape (kernels_pinhole.hpp, kernels_sphere.hpp) supplies these.
 struct ShapeKernels {
@@ -116,7 +117,7 @@ struct ShapeKernels {
   void (*project_backward)(const View&, const Geometry&, const uint32_t* sources, const float* sums, size_t count,
                            const GeometryRows&);
   // Writes the tiles that up to kReachGroup splats reach, splat by splat and row by row, and returns their number; `out`
-  // has room for all tiles of each. `number` is what the first of them is called, `reached` receives each one's tiles.
+  // has room for all tiles of each and three more. `number` is what the first of them is called, `reached` receives each one's tiles.
   size_t (*tiles_reached)(const View&, const float* splats, const Extent*, int count, uint32_t number, uint32_t* reached,
                           Found* out);
   void (*blend)(const Tile&, const Blended&);

@@ -1,179 +1,245 @@
-// Blending of one 16x16 tile, forward and backward, one 4x4 block of pixels in a vector, for splats of any shape.
+// Blending of one 16x16 tile, forward and backward, for splats of any shape. One 4x4 block of pixels is one vector.
 //
-// Both directions walk the tile's list front to back. With w = alpha T the picture is sum(w v) + T_end background. For
-// the gradients g of the picture and h of the weight let s = g . v + h be what one unit of w is worth; then
-//   d loss / d alpha = T s - (everything behind) / (1 - alpha),  everything behind = total - prefix,
+// The tile's list is taken in batches. A batch is copied together and taken apart into sixteen lists, one for each block,
+// so that a block's pixels stay in registers while its list runs by. Both directions go front to back. With
+// w = alpha T the picture is sum(w v) + T_end background. For the gradients g of the picture and h of the weight let
+// s = g . v + h be what one unit of w is worth; then with everything behind = total - prefix
+//   d loss / d ln alpha = w s - (everything behind) alpha / (1 - alpha),
 //   total = g . picture + h weight, so neither a reverse list nor a division by T is needed.
-// A pixel that has stopped keeps its transmittance with a negative sign. With a gate, a pixel stops at the first splat
-// that lies further than the gate behind the one that took its transmittance below one half.
+//
+// The product of all (1 - alpha) so far only falls: a splat counts while the product including it is not below the stop,
+// so a pixel that has stopped needs no mark. With a gate, a splat counts while it lies no further than the gate behind
+// the one that took the product below one half; the list is sorted, so such a pixel has stopped as well.
 //
 // A shape is a struct with
-//   Splat          what is drawn: plain floats, `depth` among them
-//   Pixels, pixels(view, x, y)                 what a block's sixteen pixels are to it; (x, y) is the first of them
-//   Point, log2_alpha(splat, pixels, point)    log2 of alpha before its limit, and what the derivative needs of it
-//   kGeometry, add_geometry(point, g, sums)    adds g = d loss / d ln alpha times what the shape's geometry needs
+//   Splat                                       what is drawn: plain floats, `depth` among them
+//   Pixels, pixels(view, x, y)                  what a block's sixteen pixels are to it; (x, y) is the first of them
+//   Point, log2_alpha(splat, pixels, point)     log2 of alpha before its limit, and what the derivative needs of it
+//   kGeometry, geometry_parts(point, g, parts)  what each pixel adds to the geometry sums for g = d loss / d ln alpha
 #pragma once
 
 #include "core/vector.hpp"
 #include "splats/constants.hpp"
 #include "splats/kernels.hpp"
+#include "splats/kernels_batch.hpp"
 
 namespace {
 
 using namespace rf3dgs;
 
-constexpr int kBlocks = 16;
-constexpr float kColumns[kLanes] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
-constexpr float kRows[kLanes] = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
-
-// Pixels of one block: inside the picture they start with a transmittance of one, others count as stopped.
-template <class Shape, bool kGate>
-struct Block {
-  typename Shape::Pixels pixels;
-  Vec transmittance;
-  Vec limit;  // of depth, with a gate
+// Pixels of one block: the product of (1 - alpha) of all splats so far, where T ends, and the depth up to which splats
+// count. A product of zero marks pixels outside the picture.
+template <bool kGate>
+struct Light {
+  Vec product, through, limit;
 };
 
-template <class Shape, bool kGate>
-RF_INLINE uint32_t start_blocks(const Tile& tile, Block<Shape, kGate>* blocks) {
-  uint32_t alive = 0;
-  for (int at = 0; at < kBlocks; ++at) {
-    const int block_x = tile.x + 4 * (at % 4), block_y = tile.y + 4 * (at / 4);
-    const Vec x = load(kColumns) + static_cast<float>(block_x), y = load(kRows) + static_cast<float>(block_y);
-    const IntVec inside = (x < static_cast<float>(tile.view->width)) & (y < static_cast<float>(tile.view->height));
-    blocks[at].pixels = Shape::pixels(*tile.view, block_x, block_y);
-    blocks[at].transmittance = select(inside, splat_vec(1.0f), splat_vec(-1.0f));
-    if constexpr (kGate) blocks[at].limit = splat_vec(__builtin_inff());
-    if (bits_of(inside) != 0) alive |= 1u << at;
-  }
-  return alive;
+template <bool kGate>
+RF_INLINE Light<kGate> light_of_block(const View& view, int block_x, int block_y) {
+  const Vec x = load(kColumns) + static_cast<float>(block_x), y = load(kRows) + static_cast<float>(block_y);
+  const Vec width = splat_vec(static_cast<float>(view.width)), height = splat_vec(static_cast<float>(view.height));
+  Light<kGate> light;
+  light.through = splat_vec(1.0f);
+  light.product = choose(below(x, width), choose(below(y, height), light.through, Vec{}), Vec{});
+  light.limit = splat_vec(__builtin_inff());
+  return light;
 }
 
-// What one splat does to one block: its alpha, the weight alpha T (zero where it does not count), and T before it.
+// What one splat does to one block: alpha (zero below the cut), the weight alpha T, and where it counts.
 template <class Shape>
 struct Step {
   typename Shape::Point point;
-  Vec alpha, weight, before;
-  IntVec counts, unclamped;
+  Vec alpha, weight;
+  Mask counts;
 };
 
 template <class Shape, bool kGate>
-RF_INLINE Step<Shape> step_of(const Tile& tile, const typename Shape::Splat& splat, Block<Shape, kGate>& block) {
+RF_INLINE Step<Shape> advance(const typename Shape::Splat& splat, const typename Shape::Pixels& pixels, float gate,
+                              Light<kGate>& light) {
   Step<Shape> step;
-  const Vec transmittance = step.before = block.transmittance;
-  const Vec raw = exp2_vec(Shape::log2_alpha(splat, block.pixels, step.point));
-  step.unclamped = raw <= kAlphaMax;
-  step.alpha = min_vec(raw, splat_vec(kAlphaMax));
-  const Vec after = transmittance * (1.0f - step.alpha);
-  const IntVec seen = (step.alpha >= kAlphaMin) & (transmittance > 0.0f);
-  IntVec fits = after >= kTransmittanceStop;
-  if constexpr (kGate) fits &= block.limit >= splat.depth;
-  step.counts = seen & fits;
-  step.weight = select(step.counts, step.alpha * transmittance, Vec{});
-  block.transmittance = select(step.counts, after, select(seen, -transmittance, transmittance));
+  const Vec exponent = Shape::log2_alpha(splat, pixels, step.point);
+  const Mask seen = at_least(exponent, splat_vec(kLog2AlphaMin));
+  step.alpha = keep(seen, min_vec(exp2_vec(exponent), splat_vec(kAlphaMax)));
+  const Vec weight = step.alpha * light.product, after = light.product - weight;
+  step.counts = at_least(after, splat_vec(kTransmittanceStop));
+  if constexpr (kGate) step.counts = both(step.counts, at_least(light.limit, splat_vec(splat.depth)));
+  step.weight = keep(step.counts, weight);
+  light.through = choose(step.counts, after, light.through);
   if constexpr (kGate) {
-    const IntVec takes_half = step.counts & (transmittance >= 0.5f) & (after < 0.5f);
-    block.limit = select(takes_half, splat_vec(splat.depth + tile.gate), block.limit);
+    const Mask takes_half = both(step.counts, below(after, splat_vec(0.5f)));
+    light.limit = min_vec(choose(takes_half, splat_vec(splat.depth + gate), light.limit), light.limit);
   }
+  light.product = after;
   return step;
-}
-
-template <class Shape>
-RF_INLINE const typename Shape::Splat& splat_of(const Tile& tile, const Entry& entry) {
-  return reinterpret_cast<const typename Shape::Splat*>(tile.splats)[entry.splat];
-}
-
-RF_INLINE const float* value_of(const Tile& tile, const Entry& entry) {
-  return tile.values + static_cast<size_t>(entry.splat) * tile.channels + tile.first;
-}
-
-// Calls pixel(lane, index of the pixel) for the lanes of a block inside the picture.
-template <class Function>
-RF_INLINE void each_pixel(const Tile& tile, int block, const Function& pixel) {
-  const int block_x = tile.x + 4 * (block % 4), block_y = tile.y + 4 * (block / 4);
-  for (int lane = 0; lane < kLanes; ++lane) {
-    const int col = block_x + lane % 4, row = block_y + lane / 4;
-    if (col < tile.view->width && row < tile.view->height) {
-      pixel(lane, static_cast<size_t>(row) * tile.view->width + col);
-    }
-  }
 }
 
 template <class Shape, int C, bool kGate>
 void blend_channels(const Tile& tile, const Blended& out) {
-  Block<Shape, kGate> blocks[kBlocks];
-  Vec colour[kBlocks][C] = {};
-  uint32_t alive = start_blocks<Shape, kGate>(tile, blocks);
-  for (size_t at = 0; at < tile.count; ++at) {
-    const Entry& entry = tile.entries[at];
-    const typename Shape::Splat& splat = splat_of<Shape>(tile, entry);
-    const float* value = value_of(tile, entry);
-    Vec peak = {};
-    for (uint32_t left = entry.blocks & alive; left != 0; left &= left - 1) {
-      const int block = __builtin_ctz(left);
-      const Step<Shape> step = step_of<Shape, kGate>(tile, splat, blocks[block]);
-      for (int channel = 0; channel < C; ++channel) colour[block][channel] += step.weight * value[channel];
-      if (out.peaks != nullptr) peak = max_vec(peak, step.weight);
-      if (!any_positive(blocks[block].transmittance)) alive &= ~(1u << block);
-    }
-    if (out.peaks != nullptr) out.peaks[entry.slot] = largest_of(peak);
-    else if (alive == 0) break;
-  }
+  Batch<Shape, C> batch;
+  Light<kGate> lights[kBlocks];
+  Vec colours[kBlocks][C] = {};
   for (int block = 0; block < kBlocks; ++block) {
-    each_pixel(tile, block, [&](int lane, size_t pixel) {
-      const float through = __builtin_fabsf(blocks[block].transmittance[lane]);
-      if (tile.first == 0) out.weight[pixel] = 1.0f - through;
-      for (int channel = 0; channel < C; ++channel) {
-        const float behind = out.background != nullptr ? out.background[tile.first + channel] * through : 0.0f;
-        out.picture[pixel * tile.channels + tile.first + channel] = colour[block][channel][lane] + behind;
+    lights[block] = light_of_block<kGate>(*tile.view, block_x(tile, block), block_y(tile, block));
+  }
+  uint32_t alive = blocks_inside(tile);
+  for (size_t begin = 0; begin < tile.count && alive != 0; begin += kBatch) {
+    batch.take(tile, begin, alive);
+    for (uint32_t left = alive; left != 0; left &= left - 1) {
+      const int block = __builtin_ctz(left);
+      const typename Shape::Pixels pixels = Shape::pixels(*tile.view, block_x(tile, block), block_y(tile, block));
+      Light<kGate> light = lights[block];
+      Vec colour[C];
+      for (int channel = 0; channel < C; ++channel) colour[channel] = colours[block][channel];
+      for (int at = 0; at < batch.listed[block]; ++at) {
+        const Drawn<Shape, C>& drawn = batch.drawn[batch.list[block][at]];
+        const Step<Shape> step = advance<Shape, kGate>(drawn.splat, pixels, tile.gate, light);
+        for (int channel = 0; channel < C; ++channel) {
+          colour[channel] = mul_add(step.weight, splat_vec(drawn.value[channel]), colour[channel]);
+        }
+        if (!any(step.counts)) {
+          alive &= ~(1u << block);
+          break;
+        }
       }
-    });
+      lights[block] = light;
+      for (int channel = 0; channel < C; ++channel) colours[block][channel] = colour[channel];
+    }
+  }
+  for (uint32_t left = blocks_inside(tile); left != 0; left &= left - 1) {
+    const int block = __builtin_ctz(left);
+    const Vec through = lights[block].through, weight = 1.0f - through;
+    if (tile.first == 0) store_block<1>(tile, block, &weight, 1, 0, out.weight);
+    if (out.background != nullptr) {
+      for (int channel = 0; channel < C; ++channel) {
+        colours[block][channel] += through * out.background[tile.first + channel];
+      }
+    }
+    store_block<C>(tile, block, colours[block], tile.channels, tile.first, out.picture);
   }
 }
 
+// The largest weight alpha T of each entry over the tile's pixels.
+template <class Shape, bool kGate>
+void largest_weights(const Tile& tile, float* peaks) {
+  Batch<Shape, 0> batch;
+  Light<kGate> lights[kBlocks];
+  for (int block = 0; block < kBlocks; ++block) {
+    lights[block] = light_of_block<kGate>(*tile.view, block_x(tile, block), block_y(tile, block));
+  }
+  for (size_t begin = 0; begin < tile.count; begin += kBatch) {
+    batch.take(tile, begin, blocks_inside(tile));
+    float largest[kBatch] = {};
+    for (int block = 0; block < kBlocks; ++block) {
+      const typename Shape::Pixels pixels = Shape::pixels(*tile.view, block_x(tile, block), block_y(tile, block));
+      for (int at = 0; at < batch.listed[block]; ++at) {
+        const int index = batch.list[block][at];
+        const Vec weight = advance<Shape, kGate>(batch.drawn[index].splat, pixels, tile.gate, lights[block]).weight;
+        largest[index] = __builtin_fmaxf(largest[index], largest_of(weight));
+      }
+    }
+    for (int at = 0; at < batch.count; ++at) peaks[tile.entries[begin + at].slot] = largest[at];
+  }
+}
+
+// What a block's pixels carry through the backward pass.
+template <int C>
+struct Upstream {
+  Vec behind, h, g[C];
+};
+
+template <int C>
+RF_INLINE Upstream<C> upstream_of_block(const Tile& tile, const Slopes& slopes, int block) {
+  Upstream<C> upstream{};
+  Vec weight, values[C];
+  // The weight belongs to all channels together: its gradient is added once.
+  if (slopes.weight_gradient != nullptr && tile.first == 0) {
+    load_block<1>(tile, block, slopes.weight_gradient, 1, 0, &upstream.h);
+    load_block<1>(tile, block, slopes.weight, 1, 0, &weight);
+    upstream.behind = upstream.h * weight;
+  }
+  load_block<C>(tile, block, slopes.picture_gradient, tile.channels, tile.first, upstream.g);
+  load_block<C>(tile, block, slopes.picture, tile.channels, tile.first, values);
+  for (int channel = 0; channel < C; ++channel) {
+    upstream.behind = mul_add(upstream.g[channel], values[channel], upstream.behind);
+  }
+  return upstream;
+}
+
+// Vectors whose lanes are to be summed, of a few splats one after the other, on their way to the splats' rows.
+template <int kSums, int kRow>
+struct Pending {
+  static constexpr int kMost = kSums <= 4 ? 8 : 4;
+  Vec parts[kMost * kSums];
+  int index[kMost];
+  int count = 0;
+
+  RF_INLINE void add_to(float* rows) {
+    alignas(64) float sums[kMost * kSums + 4];
+    for (int at = 0; at < count * kSums; at += 4) four_sums(parts + at, sums + at);
+    for (int at = 0; at < count; ++at) {
+      float* const row = rows + index[at] * kRow;
+      for (int column = 0; column < kRow; column += 4) {
+        store_four(row + column, load_four(row + column) + load_four(sums + at * kSums + column));
+      }
+    }
+    count = 0;
+  }
+};
+
 template <class Shape, int C, bool kGeometry, bool kGate>
 void blend_channels_backward(const Tile& tile, const Slopes& slopes) {
+  constexpr int kSums = C + 1 + (kGeometry ? Shape::kGeometry : 0);
   constexpr int kRow = gradient_row(C, kGeometry ? Shape::kGeometry : 0);
-  Block<Shape, kGate> blocks[kBlocks];
-  Vec behind[kBlocks], g[kBlocks][C], h[kBlocks];
-  uint32_t alive = start_blocks<Shape, kGate>(tile, blocks);
+  Batch<Shape, C> batch;
+  Light<kGate> lights[kBlocks];
+  Upstream<C> upstreams[kBlocks];
+  Pending<kSums, kRow> pending;
+  std::memset(pending.parts, 0, sizeof(pending.parts));
+  alignas(64) float rows[kBatch * kRow];
   for (int block = 0; block < kBlocks; ++block) {
-    alignas(64) float of_values[C][kLanes] = {}, of_weight[kLanes] = {}, total[kLanes] = {};
-    each_pixel(tile, block, [&](int lane, size_t pixel) {
-      // The weight belongs to all channels together: its gradient is added once.
-      if (slopes.weight_gradient != nullptr && tile.first == 0) of_weight[lane] = slopes.weight_gradient[pixel];
-      total[lane] = of_weight[lane] * slopes.weight[pixel];
-      for (int channel = 0; channel < C; ++channel) {
-        const size_t at = pixel * tile.channels + tile.first + channel;
-        of_values[channel][lane] = slopes.picture_gradient[at];
-        total[lane] += slopes.picture_gradient[at] * slopes.picture[at];
-      }
-    });
-    behind[block] = load(total);
-    h[block] = load(of_weight);
-    for (int channel = 0; channel < C; ++channel) g[block][channel] = load(of_values[channel]);
+    lights[block] = light_of_block<kGate>(*tile.view, block_x(tile, block), block_y(tile, block));
+    upstreams[block] = upstream_of_block<C>(tile, slopes, block);
   }
-  for (size_t at = 0; at < tile.count; ++at) {
-    const Entry& entry = tile.entries[at];
-    const typename Shape::Splat& splat = splat_of<Shape>(tile, entry);
-    const float* value = value_of(tile, entry);
-    Vec sums[kRow] = {};
-    for (uint32_t left = entry.blocks & alive; left != 0; left &= left - 1) {
+  uint32_t alive = blocks_inside(tile);
+  for (size_t begin = 0; begin < tile.count; begin += kBatch) {
+    batch.take(tile, begin, alive);
+    std::memset(rows, 0, batch.count * kRow * sizeof(float));
+    for (uint32_t left = alive; left != 0; left &= left - 1) {
       const int block = __builtin_ctz(left);
-      const Step<Shape> step = step_of<Shape, kGate>(tile, splat, blocks[block]);
-      Vec worth = h[block];
-      for (int channel = 0; channel < C; ++channel) {
-        worth += g[block][channel] * value[channel];
-        sums[channel] += step.weight * g[block][channel];
+      const typename Shape::Pixels pixels = Shape::pixels(*tile.view, block_x(tile, block), block_y(tile, block));
+      Light<kGate> light = lights[block];
+      Upstream<C> upstream = upstreams[block];
+      for (int at = 0; at < batch.listed[block]; ++at) {
+        const int index = batch.list[block][at];
+        const Drawn<Shape, C>& drawn = batch.drawn[index];
+        const Step<Shape> step = advance<Shape, kGate>(drawn.splat, pixels, tile.gate, light);
+        Vec* const parts = pending.parts + pending.count * kSums;
+        Vec worth = upstream.h;
+        for (int channel = 0; channel < C; ++channel) {
+          worth = mul_add(upstream.g[channel], splat_vec(drawn.value[channel]), worth);
+          parts[channel] = step.weight * upstream.g[channel];
+        }
+        const Vec own = step.weight * worth;
+        upstream.behind = upstream.behind - own;
+        const Vec hidden = upstream.behind * (step.alpha * reciprocal(1.0f - step.alpha));
+        const Mask free = both(step.counts, below(step.alpha, splat_vec(kAlphaMax)));
+        parts[C] = keep(free, own - hidden);
+        if constexpr (kGeometry) Shape::geometry_parts(step.point, parts[C], parts + C + 1);
+        pending.index[pending.count++] = index;
+        if (pending.count == pending.kMost) pending.add_to(rows);
+        if (!any(step.counts)) {
+          alive &= ~(1u << block);
+          break;
+        }
       }
-      behind[block] -= step.weight * worth;
-      const Vec of_alpha = step.before * worth - behind[block] / (1.0f - step.alpha);
-      const Vec of_power = select(step.counts & step.unclamped, of_alpha * step.alpha, Vec{});
-      sums[C] += of_power;
-      if constexpr (kGeometry) Shape::add_geometry(step.point, of_power, sums + C + 1);
-      if (!any_positive(blocks[block].transmittance)) alive &= ~(1u << block);
+      pending.add_to(rows);
+      lights[block] = light;
+      upstreams[block] = upstream;
     }
-    sums_of<kRow>(sums, slopes.rows + static_cast<size_t>(entry.slot) * kRow);
+    for (int at = 0; at < batch.count; ++at) {
+      std::memcpy(slopes.rows + static_cast<size_t>(tile.entries[begin + at].slot) * kRow, rows + at * kRow,
+                  kRow * sizeof(float));
+    }
   }
 }
 
@@ -185,6 +251,10 @@ void blend_chosen(const Tile& tile, const Blended& out) {
 
 template <class Shape>
 void blend(const Tile& tile, const Blended& out) {
+  if (out.peaks != nullptr && tile.first == 0) {
+    tile.gate < __builtin_inff() ? largest_weights<Shape, true>(tile, out.peaks)
+                                 : largest_weights<Shape, false>(tile, out.peaks);
+  }
   switch (tile.chunk) {
     case 1: return blend_chosen<Shape, 1>(tile, out);
     case 2: return blend_chosen<Shape, 2>(tile, out);

@@ -11,8 +11,6 @@ namespace {
 
 using namespace rf3dgs;
 
-typedef float Four __attribute__((vector_size(16)));
-
 // The basis at sixteen unit vectors.
 RF_INLINE void basis_at(Vec x, Vec y, Vec z, int bases, Vec* out) {
   out[0] = splat_vec(0.28209479177387814f);

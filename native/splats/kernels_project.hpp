@@ -6,6 +6,7 @@
 // The determinant is blur^2 + blur (|a0|^2 + |a1|^2) + |a0 x a1|^2, which needles cannot cancel.
 #pragma once
 
+#include "core/rows.hpp"
 #include "core/vector.hpp"
 #include "splats/constants.hpp"
 #include "splats/kernels.hpp"
@@ -21,6 +22,7 @@ struct PinholeSplat {
 
 struct Projection {
   Vec x, y, z;           // in the camera
+  Vec inverse_z;
   Vec qw, qx, qy, qz;    // unit quaternion
   Vec inverse_norm;
   Vec r[9];              // rotation of the quaternion
@@ -41,7 +43,6 @@ RF_INLINE Vec gather(const float* from, const size_t* index, int stride, int col
 }
 
 constexpr float kHalfLog2E = 0.5f * 1.442695040888963f;
-constexpr float kLog2AlphaMin = -7.994353436858858f;
 
 // log2(opacity / cut), how far alpha may fall before it reaches the cut, for opacities from the cut to one. With
 // x = 2^e m and m between sqrt(1/2) and sqrt(2), ln m = 2 artanh s, s = (m - 1) / (m + 1).
@@ -56,16 +57,45 @@ RF_INLINE Vec log2_above_cut(Vec opacity) {
 
 RF_INLINE IntVec is_finite(Vec value) { return (int_bits(value) & 0x7f800000) != 0x7f800000; }
 
-RF_INLINE void project_lanes(const View& view, const Geometry& in, const size_t* index, Projection& p) {
+// Where the centres are, in the camera and on the screen.
+RF_INLINE void project_centres(const View& view, const Geometry& in, const size_t* index, Projection& p) {
   const float* w = view.rotation;
-  const Vec mx = gather(in.means, index, 3, 0), my = gather(in.means, index, 3, 1), mz = gather(in.means, index, 3, 2);
-  p.x = w[0] * mx + w[1] * my + w[2] * mz + view.translation[0];
-  p.y = w[3] * mx + w[4] * my + w[5] * mz + view.translation[1];
-  p.z = w[6] * mx + w[7] * my + w[8] * mz + view.translation[2];
+  Vec mean[3];
+  load_columns_at<3>(in.means, index, mean);
+  p.x = w[0] * mean[0] + w[1] * mean[1] + w[2] * mean[2] + view.translation[0];
+  p.y = w[3] * mean[0] + w[4] * mean[1] + w[5] * mean[2] + view.translation[1];
+  p.z = w[6] * mean[0] + w[7] * mean[1] + w[8] * mean[2] + view.translation[2];
   p.fine = (p.z > kNear) & is_finite(p.x) & is_finite(p.y) & is_finite(p.z);
+  p.inverse_z = 1.0f / p.z;
+  const Vec u = p.x * p.inverse_z, v = p.y * p.inverse_z;
+  p.u_free = (u >= view.u_low) & (u <= view.u_high);
+  p.v_free = (v >= view.v_low) & (v <= view.v_high);
+  p.u = clamp_vec(u, splat_vec(view.u_low), splat_vec(view.u_high));
+  p.v = clamp_vec(v, splat_vec(view.v_low), splat_vec(view.v_high));
+  p.screen_x = view.fx * u + view.cx;
+  p.screen_y = view.fy * v + view.cy;
+  load_columns_at<3>(in.scales, index, p.s);
+}
 
-  const Vec qw = gather(in.quats, index, 4, 0), qx = gather(in.quats, index, 4, 1);
-  const Vec qy = gather(in.quats, index, 4, 2), qz = gather(in.quats, index, 4, 3);
+// Whether any of the Gaussians may touch the picture: the rows of J have the lengths fx sqrt(1 + u^2) / z and
+// fy sqrt(1 + v^2) / z, and no Gaussian is longer than its largest scale.
+RF_INLINE bool may_be_seen(const View& view, const Vec& opacity, const Projection& p) {
+  constexpr float kReach2 = 11.09f;  // no Gaussian reaches further than sqrt(2 ln 255) standard deviations
+  const Vec scale = max_vec(p.s[0], max_vec(p.s[1], p.s[2])) * p.inverse_z, scale2 = scale * scale * (1.01f * kReach2);
+  const Vec wide = sqrt_vec(scale2 * (view.fx * view.fx) * (1.0f + p.u * p.u) + kReach2 * kBlur) + 1.0f;
+  const Vec tall = sqrt_vec(scale2 * (view.fy * view.fy) * (1.0f + p.v * p.v) + kReach2 * kBlur) + 1.0f;
+  const Vec width = splat_vec(static_cast<float>(view.width)), height = splat_vec(static_cast<float>(view.height));
+  const IntVec beside = (p.screen_x + wide < 0.0f) | (p.screen_x - wide > width) | (p.screen_y + tall < 0.0f) |
+                        (p.screen_y - tall > height);
+  return (bits_of(p.fine & (opacity >= kAlphaMin)) & ~bits_of(beside)) != 0;
+}
+
+// The rest of the projection, after the centres.
+RF_INLINE void project_shapes(const View& view, const Geometry& in, const size_t* index, Projection& p) {
+  const float* w = view.rotation;
+  Vec quat[4];
+  load_columns_at<4>(in.quats, index, quat);
+  const Vec qw = quat[0], qx = quat[1], qy = quat[2], qz = quat[3];
   const Vec norm = sqrt_vec(qw * qw + qx * qx + qy * qy + qz * qz);
   p.fine &= (norm > kMinQuaternionNorm) & is_finite(norm);
   p.inverse_norm = 1.0f / norm;
@@ -82,20 +112,8 @@ RF_INLINE void project_lanes(const View& view, const Geometry& in, const size_t*
   p.r[6] = 2.0f * (p.qx * p.qz - p.qw * p.qy);
   p.r[7] = 2.0f * (p.qy * p.qz + p.qw * p.qx);
   p.r[8] = 1.0f - 2.0f * (p.qx * p.qx + p.qy * p.qy);
-  for (int axis = 0; axis < 3; ++axis) {
-    p.s[axis] = gather(in.scales, index, 3, axis);
-    p.fine &= (p.s[axis] >= 0.0f);
-  }
-
-  const Vec inverse_z = 1.0f / p.z;
-  const Vec u = p.x * inverse_z, v = p.y * inverse_z;
-  p.u_free = (u >= view.u_low) & (u <= view.u_high);
-  p.v_free = (v >= view.v_low) & (v <= view.v_high);
-  p.u = clamp_vec(u, splat_vec(view.u_low), splat_vec(view.u_high));
-  p.v = clamp_vec(v, splat_vec(view.v_low), splat_vec(view.v_high));
-  p.screen_x = view.fx * u + view.cx;
-  p.screen_y = view.fy * v + view.cy;
-  const Vec jx = view.fx * inverse_z, jy = view.fy * inverse_z;
+  for (int axis = 0; axis < 3; ++axis) p.fine &= (p.s[axis] >= 0.0f);
+  const Vec jx = view.fx * p.inverse_z, jy = view.fy * p.inverse_z;
   for (int col = 0; col < 3; ++col) {
     p.t[col] = jx * (w[col] - p.u * w[6 + col]);
     p.t[3 + col] = jy * (w[3 + col] - p.v * w[6 + col]);
@@ -119,20 +137,24 @@ RF_INLINE void project_lanes(const View& view, const Geometry& in, const size_t*
 }
 
 size_t project(const View& view, const Geometry& in, size_t begin, size_t end, const Projected& out) {
-  PinholeSplat* const splats = reinterpret_cast<PinholeSplat*>(out.splats);
   size_t visible = 0;
+  std::memset(out.radii + begin, 0, (end - begin) * sizeof(float));
   for (size_t start = begin; start < end; start += kLanes) {
     size_t index[kLanes];
     const int lanes = static_cast<int>(end - start < kLanes ? end - start : kLanes);
-    for (int lane = 0; lane < kLanes; ++lane) index[lane] = start + (lane < lanes ? lane : 0);
+    for (int lane = 0; lane < kLanes; ++lane) index[lane] = start + (lane < lanes ? lane : lanes - 1);
     Projection p;
-    project_lanes(view, in, index, p);
+    project_centres(view, in, index, p);
     const Vec opacity = gather(in.opacities, index, 1, 0);
-    IntVec fine = p.fine & (opacity >= kAlphaMin) & is_finite(opacity);
     if (in.offset != nullptr) {
-      p.screen_x += gather(in.offset, index, 2, 0);
-      p.screen_y += gather(in.offset, index, 2, 1);
+      Vec offset[2];
+      load_columns_at<2>(in.offset, index, offset);
+      p.screen_x += offset[0];
+      p.screen_y += offset[1];
     }
+    if (!may_be_seen(view, opacity, p)) continue;
+    project_shapes(view, in, index, p);
+    IntVec fine = p.fine & (opacity >= kAlphaMin) & is_finite(opacity);
     fine &= is_finite(p.screen_x) & is_finite(p.screen_y);
     const Vec middle = 0.5f * (p.sxx + p.syy), half = 0.5f * (p.sxx - p.syy);
     const Vec major = middle + sqrt_vec(half * half + p.sxy * p.sxy);
@@ -142,24 +164,25 @@ size_t project(const View& view, const Geometry& in, size_t begin, size_t end, c
     fine &= is_finite(root_p) & is_finite(root_r) & is_finite(root_s) & is_finite(major);
     const Vec above_cut = log2_above_cut(opacity), reach = sqrt_vec(above_cut * (1.0f / kHalfLog2E));
     const Vec box_x = reach * sqrt_vec(p.sxx), box_y = reach * sqrt_vec(p.syy);
-    const Vec left = p.screen_x - box_x, top = p.screen_y - box_y;
-    const Vec right = p.screen_x + box_x, bottom = p.screen_y + box_y;
-    fine &= (right > 0.0f) & (left < static_cast<float>(view.width));
-    fine &= (bottom > 0.0f) & (top < static_cast<float>(view.height));
-    for (int lane = 0; lane < lanes; ++lane) out.radii[start + lane] = 0.0f;
-    alignas(64) float of[12][kLanes];
-    const Vec parts[12] = {p.screen_x, p.screen_y,         root_p, root_r, root_s, above_cut + kLog2AlphaMin,
-                           p.z,        reach * sqrt_vec(major), left,   top,    right,  bottom};
-    for (int part = 0; part < 12; ++part) store(of[part], parts[part]);
-    for (uint32_t left_over = bits_of(fine) & ((1u << lanes) - 1u); left_over != 0; left_over &= left_over - 1) {
-      const int lane = __builtin_ctz(left_over);
-      splats[visible] = {of[0][lane], of[1][lane], of[2][lane], of[3][lane],
-                         of[4][lane], of[5][lane], of[6][lane], 0.0f};
-      out.extents[visible] = {of[8][lane], of[9][lane], of[10][lane], of[11][lane]};
+    const Vec extent[4] = {p.screen_x - box_x, p.screen_y - box_y, p.screen_x + box_x, p.screen_y + box_y};
+    fine &= (extent[2] > 0.0f) & (extent[0] < static_cast<float>(view.width));
+    fine &= (extent[3] > 0.0f) & (extent[1] < static_cast<float>(view.height));
+    const Vec splat[8] = {p.screen_x, p.screen_y, root_p, root_r, root_s, above_cut + kLog2AlphaMin, p.z, Vec{}};
+    alignas(64) float radius[kLanes], nobody[8];
+    store(radius, reach * sqrt_vec(major));
+    const uint32_t seen = bits_of(fine) & ((1u << lanes) - 1u);
+    float *splats[kLanes], *extents[kLanes];
+    for (int lane = 0; lane < kLanes; ++lane) splats[lane] = extents[lane] = nobody;
+    for (uint32_t left = seen; left != 0; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      splats[lane] = out.splats + 8 * visible;
+      extents[lane] = &out.extents[visible].left;
       out.sources[visible] = static_cast<uint32_t>(start + lane);
-      out.radii[start + lane] = of[7][lane];
+      out.radii[start + lane] = radius[lane];
       ++visible;
     }
+    store_columns<8>(splat, splats, kLanes);
+    store_columns<4>(extent, extents, kLanes);
   }
   return visible;
 }
@@ -171,17 +194,18 @@ void project_backward(const View& view, const Geometry& in, const uint32_t* sour
     const int lanes = static_cast<int>(count - start < kLanes ? count - start : kLanes);
     size_t index[kLanes], row[kLanes];
     for (int lane = 0; lane < kLanes; ++lane) {
-      row[lane] = start + (lane < lanes ? lane : 0);
+      row[lane] = start + (lane < lanes ? lane : lanes - 1);
       index[lane] = sources[row[lane]];
     }
     Projection p;
-    project_lanes(view, in, index, p);
+    project_centres(view, in, index, p);
+    project_shapes(view, in, index, p);
     const Vec qa = p.syy * p.inverse_determinant, qb = -p.sxy * p.inverse_determinant;
     const Vec qc = p.sxx * p.inverse_determinant;
-    const Vec sum_x = gather(sums, row, 5, 0), sum_y = gather(sums, row, 5, 1);
-    const Vec gx = qa * sum_x + qb * sum_y, gy = qb * sum_x + qc * sum_y;
-    const Vec ga = -0.5f * gather(sums, row, 5, 2), gb = -0.5f * gather(sums, row, 5, 3);
-    const Vec gc = -0.5f * gather(sums, row, 5, 4);
+    Vec sum[5];
+    load_columns_at<5>(sums, row, sum);
+    const Vec gx = qa * sum[0] + qb * sum[1], gy = qb * sum[0] + qc * sum[1];
+    const Vec ga = -0.5f * sum[2], gb = -0.5f * sum[3], gc = -0.5f * sum[4];
 
     // D = -Q G Q, the gradient with respect to Sigma2.
     const Vec h00 = ga * qa + gb * qb, h01 = ga * qb + gb * qc, h10 = gb * qa + gc * qb, h11 = gb * qb + gc * qc;
@@ -219,7 +243,7 @@ void project_backward(const View& view, const Geometry& in, const uint32_t* sour
     dy = (dy - p.qy * along) * p.inverse_norm;
     dz = (dz - p.qz * along) * p.inverse_norm;
 
-    const Vec inverse_z = 1.0f / p.z;
+    const Vec inverse_z = p.inverse_z;
     const Vec jx = view.fx * inverse_z, jy = view.fy * inverse_z;
     const Vec j00 = w[0] * dt[0] + w[1] * dt[1] + w[2] * dt[2], j02 = w[6] * dt[0] + w[7] * dt[1] + w[8] * dt[2];
     const Vec j11 = w[3] * dt[3] + w[4] * dt[4] + w[5] * dt[5], j12 = w[6] * dt[3] + w[7] * dt[4] + w[8] * dt[5];
@@ -230,21 +254,13 @@ void project_backward(const View& view, const Geometry& in, const uint32_t* sour
     const Vec pz = inverse_z * (-jx * j00 - jy * j11 + jx * p.u * j02 + jy * p.v * j12) -
                    inverse_z * inverse_z * (p.x * du + p.y * dv) -
                    inverse_z * inverse_z * (view.fx * p.x * gx + view.fy * p.y * gy);
-    for (int lane = 0; lane < lanes; ++lane) {
-      float* means = out.means + 3 * row[lane];
-      float* scales = out.scales + 3 * row[lane];
-      for (int col = 0; col < 3; ++col) {
-        means[col] = w[col] * px[lane] + w[3 + col] * py[lane] + w[6 + col] * pz[lane];
-        scales[col] = ds[col][lane];
-      }
-      float* quats = out.quats + 4 * row[lane];
-      quats[0] = dw[lane];
-      quats[1] = dx[lane];
-      quats[2] = dy[lane];
-      quats[3] = dz[lane];
-      out.offset[2 * row[lane]] = gx[lane];
-      out.offset[2 * row[lane] + 1] = gy[lane];
-    }
+    Vec mean[3];
+    for (int col = 0; col < 3; ++col) mean[col] = w[col] * px + w[3 + col] * py + w[6 + col] * pz;
+    const Vec quat[4] = {dw, dx, dy, dz}, offset[2] = {gx, gy};
+    store_columns_to<3>(mean, out.means + 3 * start, lanes);
+    store_columns_to<4>(quat, out.quats + 4 * start, lanes);
+    store_columns_to<3>(ds, out.scales + 3 * start, lanes);
+    store_columns_to<2>(offset, out.offset + 2 * start, lanes);
   }
 }
 

@@ -2,7 +2,9 @@
 
 #include <algorithm>
 #include <bit>
-#include <cmath>
+#include <cstring>
+#include <numeric>
+#include <utility>
 
 #include "core/thread_pool.hpp"
 #include "splats/binning.hpp"
@@ -21,55 +23,50 @@ int next_chunk(int left) {
 
 const ShapeKernels& shape_of(const View& view) { return kernels().shape[static_cast<int>(view.kind)]; }
 
-bool all_finite(const float* values, int count) {
-  bool fine = true;
-  for (int at = 0; at < count; ++at) fine &= (std::bit_cast<uint32_t>(values[at]) & 0x7f800000u) != 0x7f800000u;
-  return fine;
+bool all_finite(const float* values, size_t count) {
+  constexpr uint32_t kExponent = 0x7f800000u;
+  uint32_t odd = 0;
+  for (size_t at = 0; at < count; ++at) odd |= (std::bit_cast<uint32_t>(values[at]) & kExponent) == kExponent;
+  return odd == 0;
 }
 
-// Projects everything; the visible splats of a chunk lie at the chunk's place, gaps follow.
-void project(Scene& scene, const Geometry& geometry, int threads, float* radii) {
+// Projects a chunk of Gaussians, gets the values of what is visible, and finds the tiles it reaches.
+void project_chunk(Scene& scene, const Geometry& geometry, const ValuesOf& values_of, int chunk, float* radii) {
   SceneMemory& memory = *scene.memory;
   const ShapeKernels& shape = shape_of(scene.view);
-  float* const splats = memory.wide_splats.resize(scene.gaussians * shape.splat_floats);
-  uint32_t* const sources = memory.wide_sources.resize(scene.gaussians);
-  Extent* const extents = memory.wide_extents.resize(scene.gaussians);
-  size_t* const start = memory.chunk_start.resize(scene.chunks() + 1);
-  start[0] = 0;
-  parallel_for(scene.chunks(), threads, [&](int chunk) {
-    const size_t begin = chunk * kChunk, end = std::min(scene.gaussians, begin + kChunk);
-    const Projected out = {splats + begin * shape.splat_floats, sources + begin, extents + begin, radii};
-    start[chunk + 1] = shape.project(scene.view, geometry, begin, end, out);
-  });
-  for (int chunk = 0; chunk < scene.chunks(); ++chunk) start[chunk + 1] += start[chunk];
-  scene.visible = start[scene.chunks()];
-}
-
-// Moves the visible splats together, gets their values and finds the tiles they reach.
-void gather_visible(Scene& scene, const ValuesOf& values_of, int threads, float* radii) {
-  SceneMemory& memory = *scene.memory;
-  const size_t width = shape_of(scene.view).splat_floats, channels = scene.channels;
-  float* const splats = memory.splats.resize(scene.visible * width);
-  uint32_t* const sources = memory.sources.resize(scene.visible);
-  float* const values = memory.values.resize(scene.visible * channels);
-  memory.slots.resize(scene.visible + 1);
-  memory.tile_counts.resize(static_cast<size_t>(scene.chunks()) * scene.tiles());
-  memory.pairs.resize(scene.chunks());
-  if (memory.found.size() < static_cast<size_t>(scene.chunks())) memory.found.resize(scene.chunks());
-  parallel_for(scene.chunks(), threads, [&](int chunk) {
-    const size_t from = chunk * kChunk, begin = memory.chunk_start[chunk], end = memory.chunk_start[chunk + 1];
-    std::copy_n(memory.wide_splats.data() + from * width, (end - begin) * width, splats + begin * width);
-    std::copy_n(memory.wide_sources.data() + from, end - begin, sources + begin);
-    if (begin < end) values_of(begin, end, sources + begin, values + begin * channels);
-    Extent* const extents = memory.wide_extents.data() + from;
-    for (size_t at = begin; at < end; ++at) {
-      if (all_finite(values + at * channels, scene.channels)) continue;
+  const size_t begin = chunk * kChunk, last = std::min(scene.gaussians, begin + kChunk), channels = scene.channels;
+  uint32_t* const sources = memory.sources.data() + begin;
+  Extent* const extents = memory.extents.data() + begin;
+  float* const values = memory.values.data() + begin * channels;
+  const Projected out = {memory.splats.data() + begin * shape.splat_floats, sources, extents, radii};
+  const size_t visible = shape.project(scene.view, geometry, begin, last, out);
+  memory.chunk_visible[chunk] = static_cast<uint32_t>(visible);
+  if (visible > 0) values_of(begin, begin + visible, sources, values);
+  if (!all_finite(values, visible * channels)) {
+    for (size_t at = 0; at < visible; ++at) {
+      if (all_finite(values + at * channels, channels)) continue;
       std::fill_n(values + at * channels, channels, 0.0f);
-      extents[at - begin] = kNowhere;
+      extents[at] = kNowhere;
       radii[sources[at]] = 0.0f;
     }
-    find_tiles(scene, chunk, extents);
-  });
+  }
+  find_tiles(scene, chunk);
+}
+
+void project(Scene& scene, const Geometry& geometry, const ValuesOf& values_of, int threads, float* radii) {
+  SceneMemory& memory = *scene.memory;
+  const size_t chunks = scene.chunks();
+  memory.chunk_visible.resize(chunks);
+  memory.splats.resize(scene.gaussians * shape_of(scene.view).splat_floats);
+  memory.sources.resize(scene.gaussians);
+  memory.extents.resize(scene.gaussians);
+  memory.values.resize(scene.gaussians * scene.channels);
+  memory.slots.resize(chunks * (kChunk + 1));
+  memory.tile_counts.resize(chunks * scene.tiles());
+  if (memory.found.size() < chunks) memory.found.resize(chunks);
+  parallel_for(scene.chunks(), threads,
+               [&](int chunk) { project_chunk(scene, geometry, values_of, chunk, radii); });
+  scene.visible = std::accumulate(memory.chunk_visible.data(), memory.chunk_visible.data() + chunks, size_t{0});
 }
 
 Tile tile_of(const Scene& scene, int index) {
@@ -87,14 +84,19 @@ Tile tile_of(const Scene& scene, int index) {
   return tile;
 }
 
+// The slots of a visible splat, which is the index-th of its chunk.
+std::pair<size_t, size_t> slots_of(const SceneMemory& memory, int chunk, size_t index) {
+  const uint32_t* const first = memory.slots.data() + chunk * (kChunk + 1) + index;
+  return {memory.chunk_slot[chunk] + first[0], memory.chunk_slot[chunk] + first[1]};
+}
+
 void keep_largest_weights(const Scene& scene, int threads, float* max_weight) {
   const SceneMemory& memory = *scene.memory;
   parallel_for(scene.chunks(), threads, [&](int chunk) {
-    for (size_t at = memory.chunk_start[chunk]; at < memory.chunk_start[chunk + 1]; ++at) {
-      float& largest = max_weight[memory.sources[at]];
-      for (uint32_t slot = memory.slots[at]; slot < memory.slots[at + 1]; ++slot) {
-        largest = std::max(largest, memory.peaks[slot]);
-      }
+    for (size_t index = 0; index < memory.chunk_visible[chunk]; ++index) {
+      float& largest = max_weight[memory.sources[chunk * kChunk + index]];
+      const auto [begin, end] = slots_of(memory, chunk, index);
+      for (size_t slot = begin; slot < end; ++slot) largest = std::max(largest, memory.peaks[slot]);
     }
   });
 }
@@ -102,22 +104,29 @@ void keep_largest_weights(const Scene& scene, int threads, float* max_weight) {
 // Adds up the rows of a chunk's splats: `width` channels of the values from `first` on, and the sums that belong to all
 // channels together.
 void reduce_rows(Scene& scene, int chunk, int first, int width, int geometry_sums) {
-  constexpr int kMost = kLargestChunk + 16;
+  typedef float Four __attribute__((vector_size(16)));
+  constexpr int kMostFours = (kLargestChunk + 1 + kMostGeometrySums + 3) / 4;
   SceneMemory& memory = *scene.memory;
-  const int row = gradient_row(width, geometry_sums);
-  for (size_t at = memory.chunk_start[chunk]; at < memory.chunk_start[chunk + 1]; ++at) {
-    float total[kMost] = {};
-    for (uint32_t slot = memory.slots[at]; slot < memory.slots[at + 1]; ++slot) {
-      const float* from = memory.rows.data() + static_cast<size_t>(slot) * row;
-      for (int column = 0; column < row; ++column) total[column] += from[column];
+  const int row = gradient_row(width, geometry_sums), fours = row / 4;
+  for (size_t index = 0; index < memory.chunk_visible[chunk]; ++index) {
+    const size_t at = chunk * kChunk + index;
+    const auto [begin, end] = slots_of(memory, chunk, index);
+    Four total[kMostFours] = {};
+    const float* from = memory.rows.data() + begin * row;
+    for (size_t slot = begin; slot < end; ++slot) {
+      for (int four = 0; four < fours; ++four, from += 4) {
+        Four part;
+        std::memcpy(&part, from, sizeof(part));
+        total[four] += part;
+      }
     }
-    std::copy_n(total, width, memory.values_gradient.data() + at * scene.channels + first);
+    const float* sums = reinterpret_cast<const float*>(total);
+    float* const values = memory.values_gradient.data() + at * scene.channels + first;
+    for (int channel = 0; channel < width; ++channel) values[channel] = *sums++;
     float& ln_alpha = memory.ln_alpha_gradient[at];
+    ln_alpha = *sums++ + (first == 0 ? 0.0f : ln_alpha);
     float* const geometry = memory.geometry_sums.data() + at * geometry_sums;
-    ln_alpha = total[width] + (first == 0 ? 0.0f : ln_alpha);
-    for (int sum = 0; sum < geometry_sums; ++sum) {
-      geometry[sum] = total[width + 1 + sum] + (first == 0 ? 0.0f : geometry[sum]);
-    }
+    for (int sum = 0; sum < geometry_sums; ++sum) geometry[sum] = *sums++ + (first == 0 ? 0.0f : geometry[sum]);
   }
 }
 
@@ -125,7 +134,7 @@ void reduce_rows(Scene& scene, int chunk, int first, int width, int geometry_sum
 void hand_over(const Scene& scene, const Geometry& geometry, int chunk, int geometry_sums, const TakeGradients& take) {
   thread_local Buffer<float> memory_of_rows, opacities;
   const SceneMemory& memory = *scene.memory;
-  const size_t begin = memory.chunk_start[chunk], end = memory.chunk_start[chunk + 1], count = end - begin;
+  const size_t begin = chunk * kChunk, count = memory.chunk_visible[chunk], end = begin + count;
   if (count == 0) return;
   const uint32_t* const sources = memory.sources.data() + begin;
   const float* const values = memory.values_gradient.data() + begin * scene.channels;
@@ -160,8 +169,7 @@ std::unique_ptr<Scene> rasterize(const View& view, size_t count, const Geometry&
   scene->gate = gate;
   scene->tiles_x = (view.width + kTileSize - 1) / kTileSize;
   scene->tiles_y = (view.height + kTileSize - 1) / kTileSize;
-  project(*scene, geometry, threads, radii);
-  gather_visible(*scene, values_of, threads, radii);
+  project(*scene, geometry, values_of, threads, radii);
   list_tiles(*scene, threads);
   SceneMemory& memory = *scene->memory;
   const ShapeKernels& shape = shape_of(view);
@@ -169,7 +177,7 @@ std::unique_ptr<Scene> rasterize(const View& view, size_t count, const Geometry&
                        max_weight == nullptr ? nullptr : memory.peaks.resize(scene->entries)};
   parallel_for(scene->tiles(), threads, [&](int index) {
     Tile tile = tile_of(*scene, index);
-    sort_by_depth(memory.entries.data() + memory.tile_start[index], tile.count);
+    sort_by_depth(*scene, index);
     for (; tile.first < channels; tile.first += tile.chunk) {
       tile.chunk = next_chunk(channels - tile.first);
       shape.blend(tile, out);
@@ -185,9 +193,9 @@ void rasterize_backward(Scene& scene, const Geometry& geometry, const float* pic
   SceneMemory& memory = *scene.memory;
   const ShapeKernels& shape = shape_of(scene.view);
   const int geometry_sums = which == Which::everything ? shape.geometry_sums : 0;
-  memory.values_gradient.resize(scene.visible * scene.channels);
-  memory.ln_alpha_gradient.resize(scene.visible);
-  memory.geometry_sums.resize(scene.visible * geometry_sums);
+  memory.values_gradient.resize(scene.gaussians * scene.channels);
+  memory.ln_alpha_gradient.resize(scene.gaussians);
+  memory.geometry_sums.resize(scene.gaussians * geometry_sums);
   int width = 0;
   for (int first = 0; first < scene.channels; first += width) {
     width = next_chunk(scene.channels - first);

@@ -1,7 +1,7 @@
 // The rasterizer: Gaussians in, picture out, and back.
 //
-// Forward: project and keep what is visible, ask the caller for the values of these, list for every 16x16 tile the
-// splats that reach it, sort each list by depth (ties by index), blend. Backward: blend once more per tile into a row of
+// Forward: project chunks of Gaussians and keep what is visible, ask the caller for the values of these, list for every
+// 16x16 tile the splats that reach it, sort each list by depth (ties by index), blend. Backward: blend once more per tile into a row of
 // gradients per list entry, add these per Gaussian in the order of the tiles, take them back through the projection and
 // hand them to the caller. Only the lists are in depth order: the splats and all that is kept for them stay in the order
 // of the Gaussians, so that memory is read as it lies. Every sum has one order and every chunk one place, so results do
@@ -15,14 +15,15 @@
 
 namespace rf3dgs {
 
-// Writes the values [end - begin, channels] of visible splats begin..end; `sources` are their indices among the caller's
-// Gaussians, both pointers belong to splat `begin`. Called in parallel with chunks that do not overlap. A splat whose
-// values are not finite is not drawn: it keeps its place, reaches no pixel and has a radius of zero.
+// Writes the values [end - begin, channels] of visible splats at places begin..end (see SceneMemory: every place is below
+// the number of Gaussians); `sources` are their indices among the caller's Gaussians, both pointers belong to `begin`.
+// Called in parallel with ranges that do not overlap. A splat whose values are not finite is not drawn: it keeps its
+// place, reaches no pixel and has a radius of zero.
 using ValuesOf = std::function<void(size_t begin, size_t end, const uint32_t* sources, float* values)>;
 
-// Takes the gradients of visible splats begin..end: of their values [., channels], of opacity [.] and of geometry (null
-// unless it was asked for). All pointers belong to splat `begin`. Called in parallel, once for every visible splat; the
-// chunks' boundaries do not depend on the number of threads.
+// Takes the gradients of visible splats at places begin..end: of their values [., channels], of opacity [.] and of
+// geometry (null unless it was asked for). All pointers belong to `begin`. Called in parallel, once for every visible
+// splat; the ranges do not depend on the number of threads.
 using TakeGradients = std::function<void(size_t begin, size_t end, const uint32_t* sources, const float* values_gradient,
                                          const float* opacity_gradient, const GeometryRows* geometry)>;
 
@@ -36,7 +37,7 @@ std::unique_ptr<Scene> rasterize(const View& view, size_t count, const Geometry&
 
 enum class Which { appearance, everything };  // values and opacities; geometry as well
 
-// `picture` without its background's share would not do: it is what `rasterize` wrote. `weight_gradient` may be null.
+// `picture` and `weight` are what `rasterize` wrote; `weight_gradient` may be null.
 void rasterize_backward(Scene& scene, const Geometry& geometry, const float* picture, const float* weight,
                         const float* picture_gradient, const float* weight_gradient, Which which, int threads,
                         const TakeGradients& take);

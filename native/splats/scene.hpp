@@ -1,6 +1,7 @@
 // What the forward pass leaves for the backward pass, in memory that is recycled.
 #pragma once
 
+#include <bit>
 #include <vector>
 
 #include "core/buffer.hpp"
@@ -11,29 +12,29 @@ namespace rf3dgs {
 // The Gaussians are cut into chunks of this many: the unit of work of everything that is done per Gaussian.
 constexpr size_t kChunk = 2048;
 
+// Places number the visible splats: chunk * kChunk for the first of a chunk, gaps behind the last. They keep the order of
+// the Gaussians.
 struct SceneMemory {
-  // Of the visible splats, in the order of the Gaussians.
-  Buffer<float> splats;       // [visible, splat_floats]
-  Buffer<uint32_t> sources;   // [visible] indices among the caller's Gaussians
-  Buffer<float> values;       // [visible, channels]
-  Buffer<uint32_t> slots;     // [visible + 1] first slot of each splat
-  Buffer<size_t> chunk_start; // [chunk + 1] first visible splat of each chunk of Gaussians
+  Buffer<uint32_t> chunk_visible;  // [chunk] visible splats
+  Buffer<float> splats;            // [place, splat_floats]
+  Buffer<uint32_t> sources;        // [place] indices among the caller's Gaussians
+  Buffer<Extent> extents;          // [place]
+  Buffer<float> values;            // [place, channels]
   // Tile by tile, front to back.
   Buffer<Entry> entries;
-  Buffer<size_t> tile_start;  // [tile + 1]
-
+  Buffer<size_t> tile_start;       // [tile + 1]
+  // Where the gradients of entries go: chunk by chunk, splat by splat, tile by tile.
+  Buffer<size_t> chunk_slot;       // [chunk + 1]
+  Buffer<uint32_t> slots;          // [chunk, kChunk + 1] first slot of each splat after the chunk's first
   // Of the passes themselves.
-  Buffer<float> wide_splats;  // as projected, chunk by chunk with gaps
-  Buffer<uint32_t> wide_sources;
-  Buffer<Extent> wide_extents;
   std::vector<Buffer<Found>> found;  // [chunk]
-  Buffer<size_t> tile_counts;        // [chunk, tile]
-  Buffer<uint64_t> pairs;            // [chunk]
+  Buffer<uint32_t> tile_counts;      // [chunk, tile]
+  Buffer<Entry> unsorted;
   Buffer<float> peaks;               // [slot]
   Buffer<float> rows;                // [slot, gradient_row]
-  Buffer<float> values_gradient;     // [visible, channels]
-  Buffer<float> ln_alpha_gradient;   // [visible]
-  Buffer<float> geometry_sums;       // [visible, geometry sums]
+  Buffer<float> values_gradient;     // [place, channels]
+  Buffer<float> ln_alpha_gradient;   // [place]
+  Buffer<float> geometry_sums;       // [place, geometry sums]
 };
 
 struct Scene {
@@ -44,12 +45,16 @@ struct Scene {
   float gate = 0.0f;
   size_t visible = 0;
   size_t entries = 0;  // splats in the lists of tiles
-  size_t pairs = 0;    // splats in 4x4 blocks of pixels
   Recycled<SceneMemory> memory;
 
-  const uint32_t* sources() const { return memory->sources.data(); }
   int chunks() const { return static_cast<int>((gaussians + kChunk - 1) / kChunk); }
   int tiles() const { return tiles_x * tiles_y; }
+  // How many splats reach a 4x4 block of pixels, over all blocks.
+  size_t pairs() const {
+    size_t sum = 0;
+    for (size_t at = 0; at < entries; ++at) sum += std::popcount(memory->entries[at].blocks);
+    return sum;
+  }
 };
 
 }  // namespace rf3dgs
