@@ -9,7 +9,7 @@ import torch
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose, matrix_from_quaternion
 from rf3dgs.core.grids import Camera, pinhole_grid
-from rf3dgs.splats.detail import level_of_detail
+from rf3dgs.splats.detail import largest_weights, level_of_detail, prune_unseen
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.rasterize import rasterize
 from rf3dgs.splats.surface import normals, sample_mesh
@@ -126,7 +126,7 @@ def test_nearer_positions_and_margins_keep_more():
     before = wall()
     counts = [
         len(level_of_detail(before, torch.tensor([[0.0, 0.0, z]]), pixel=PIXEL, margin=margin).gaussians)
-        for z, margin in ((4.0, 0.0), (2.0, 0.0), (2.0, 1.0), (1.0, 0.0))
+        for z, margin in ((4.0, 0.0), (2.0, 0.0), (1.0, 0.0), (1.0, 0.3))
     ]
     assert counts[0] < counts[1] < counts[2] < counts[3] <= len(before)
 
@@ -183,3 +183,52 @@ def test_gaussians_that_are_none_or_not_finite_are_refused():
     ):
         with pytest.raises(InputError, match=message):
             level_of_detail(gaussians, torch.ones(1, 3), pixel=PIXEL)
+
+
+def view(position: tuple, target: tuple, size: int = 32) -> Camera:
+    return Camera.of(Pose.look_at(position=position, target=target), pinhole_grid(size, size, 60.0))
+
+
+def test_the_largest_weights_of_the_core_are_those_of_the_reference():
+    cloud = Gaussians.random(150, (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), channels=1, degree=0, seed=2)
+    views = [view((3.0, 0.5, 0.2), (0.0, 0.0, 0.0)), view((-0.2, 2.5, 0.1), (0.3, 0.0, 0.0))]
+    fast = largest_weights(cloud, views, backend="native")
+    torch.testing.assert_close(fast, largest_weights(cloud, views, backend="reference"), rtol=0, atol=2e-5)
+    assert 0.05 < fast.median() < 0.5
+    only = [largest_weights(cloud, [one]) for one in views]
+    assert torch.equal(fast, torch.maximum(*only))
+
+
+def test_pruning_removes_what_a_wall_hides_and_the_picture_stays():
+    before = Gaussians.join([wall(0.1, height=0.0), wall(0.1, height=-0.5)])
+    views = [view((0.0, 0.01, 2.0), (0.0, 0.0, 0.0))]
+    detail = prune_unseen(before, views)
+    assert 0.05 * len(before) < len(detail.gaussians) < 0.5 * len(before)
+    assert (detail.gaussians.means[:, 2] == 0).float().mean() > 0.95
+    lost = [weight_of(one, (0.0, 0.01, 2.0), (0.0, 0.0, 0.0), 32) for one in (before, detail.gaussians)]
+    assert (lost[0] - lost[1]).abs().max() < 0.01
+    kept = detail.cluster >= 0
+    assert torch.equal(detail.gaussians.means[detail.cluster[kept]], before.means[kept])
+    assert torch.equal(detail.gather(before.means), detail.gaussians.means)
+    assert torch.equal(detail.spread(torch.ones(len(detail.gaussians))), kept.float())
+
+
+def test_two_steps_are_one():
+    before = corner_of_walls(spacing=0.04)
+    seen = prune_unseen(before, [view((1.5, 1.0, 1.5), (0.0, 1.0, 0.0))])
+    merged = level_of_detail(seen.gaussians, torch.tensor([[1.5, 1.0, 1.5]]), pixel=2 * PIXEL, margin=0.0)
+    both = seen.then(merged)
+    values = torch.rand(len(before), 3, generator=torch.Generator().manual_seed(0))
+    assert len(both.gaussians) < len(seen.gaussians) < len(before)
+    torch.testing.assert_close(both.gather(values), merged.gather(seen.gather(values)))
+    assert torch.equal(both.spread(both.gaussians.means), seen.spread(merged.spread(both.gaussians.means)))
+
+
+def test_pruning_refuses_what_it_cannot_judge():
+    gaussians, views = wall(0.5), [view((0.0, 0.01, 2.0), (0.0, 0.0, 0.0))]
+    with pytest.raises(InputError, match="at least one view; got none"):
+        prune_unseen(gaussians, [])
+    with pytest.raises(InputError, match="keep_weight must be above 0 and at most 1; got 0"):
+        prune_unseen(gaussians, views, keep_weight=0.0)
+    with pytest.raises(InputError, match="no view shows any of the"):
+        prune_unseen(gaussians, [view((0.0, 0.01, 2.0), (0.0, 0.0, 4.0))])

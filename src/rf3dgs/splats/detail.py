@@ -1,11 +1,12 @@
 """Level of detail: fewer Gaussians where no receiver can tell them apart.
 
-`level_of_detail` merges neighbours that fall into one pixel at the nearest receiver, or into a few where a surface
-goes on in all directions. Whoever had harmonics before or gets some after can carry them both ways: a `Detail`
-remembers where each Gaussian went.
+`prune_unseen` removes what shows in no picture; `level_of_detail` merges neighbours that fall into one pixel at the
+nearest receiver, or into a few where a surface goes on in all directions. Whoever had harmonics before or gets some
+after can carry them both ways: a `Detail` remembers where each Gaussian went.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,19 +14,26 @@ from torch import Tensor
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import matrix_from_quaternion, quaternion_from_matrix
+from rf3dgs.core.grids import Camera
+from rf3dgs.splats.backends.native import raise_to_weights_native
 from rf3dgs.splats.cells import shared_cells
 from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.splats.rasterize import Backend, pick_backend, rasterize
 from rf3dgs.splats.surface import normals
 
 DENSEST = 0.98  # largest opacity of a merged Gaussian; what does not fit in makes it wider
 WIDEST = 2.4  # by at most this factor: the members fill a square cell with a deviation of 0.29 of its width, a closed
 # lattice needs 0.7
+CHANNELS = 64  # of a picture that shows one Gaussian in each
 NEAREST = 0.5  # the margin of new positions takes at most this share of a distance
 
 
 @dataclass(frozen=True, eq=False)
 class Detail:
-    """Fewer `gaussians`; the new one `cluster` `[old]` into which each old one went, and its `share` `[old]` of it."""
+    """Fewer `gaussians`; the new one `cluster` `[old]` into which each old one went, and its `share` `[old]` of it.
+
+    Removed ones have cluster -1 and share 0.
+    """
 
     gaussians: Gaussians
     cluster: Tensor
@@ -34,18 +42,71 @@ class Detail:
     def gather(self, values: Tensor) -> Tensor:
         """Means `[new, ...]` of the old Gaussians' values `[old, ...]`, weighted by their shares."""
         self._check(values, len(self.cluster), "old")
-        return _weighted_sum(values, self.cluster, self.share, len(self.gaussians)).to(values.dtype)
+        return _weighted_sum(values, self.cluster.clamp_min(0), self.share, len(self.gaussians)).to(values.dtype)
 
     def spread(self, values: Tensor) -> Tensor:
-        """Values `[old, ...]`: to every old Gaussian that of the new one `[new, ...]` it went into."""
+        """Values `[old, ...]`: that of the new one `[new, ...]` into which each old one went, 0 for removed ones."""
         self._check(values, len(self.gaussians), "new")
-        return values[self.cluster]
+        result = values[self.cluster]
+        result[self.cluster < 0] = 0
+        return result
+
+    def then(self, later: "Detail") -> "Detail":
+        """This step and a later one, made from its Gaussians, as one."""
+        self._check(later.cluster, len(self.gaussians), "new")
+        cluster = torch.where(self.cluster < 0, -1, later.cluster[self.cluster])
+        return Detail(later.gaussians, cluster, torch.where(cluster < 0, 0.0, self.share * later.share[self.cluster]))
 
     def _check(self, values: Tensor, count: int, which: str) -> None:
         if values.dim() < 1 or len(values) != count:
             raise InputError(
                 f"values must have a row for each of the {count} {which} Gaussians; got {list(values.shape)}"
             )
+
+
+@torch.no_grad()
+def largest_weights(gaussians: Gaussians, views: Sequence[Camera], *, backend: Backend = "auto") -> Tensor:
+    """The largest blending weight `[gaussian]`, 0..1, that each Gaussian has in any pixel of any view.
+
+    The native core finds it in the forward pass. Other backends draw a channel for each Gaussian, which is for small
+    scenes and the specification.
+    """
+    now = gaussians.detach()
+    shape = now.means, now.quats, now.scales, now.opacities
+    largest = torch.zeros(len(now))
+    native = (pick_backend()[0] if backend == "auto" else backend) == "native"
+    for view in views:
+        if native:
+            raise_to_weights_native(largest, shape, view)
+            continue
+        for some in torch.arange(len(now)).split(CHANNELS):
+            one = torch.zeros(len(now), len(some)).index_put_((some, torch.arange(len(some))), torch.ones(len(some)))
+            drawn = rasterize(*shape, one, view, backend=backend).values.flatten(0, 1).amax(0)
+            largest[some] = torch.maximum(largest[some], drawn)
+    return largest
+
+
+def prune_unseen(
+    gaussians: Gaussians, views: Sequence[Camera], *, keep_weight: float = 0.01, backend: Backend = "auto"
+) -> Detail:
+    """Remove the Gaussians whose blending weight stays below `keep_weight` in every pixel of every one of `views`.
+
+    They lie behind walls, inside of things, beside all pictures, or are too faint. Raises InputError without views and
+    when nothing would remain.
+    """
+    gaussians.check()
+    if not views:
+        raise InputError("pruning needs at least one view; got none. Give the training views")
+    if not 0 < keep_weight <= 1:
+        raise InputError(f"keep_weight must be above 0 and at most 1; got {keep_weight}")
+    kept = largest_weights(gaussians, views, backend=backend) >= keep_weight
+    if not bool(kept.any()):
+        raise InputError(
+            f"no view shows any of the {len(gaussians)} Gaussians with a weight of {keep_weight:g}; check that the "
+            "geometry and the views share one world, or lower keep_weight"
+        )
+    cluster = torch.where(kept, kept.cumsum(0) - 1, -1)
+    return Detail(gaussians.detach().subset(kept), cluster, kept.float())
 
 
 @torch.no_grad()
