@@ -163,9 +163,9 @@ def test_harmonics_are_carried_both_ways():
         ({"positions": torch.zeros(0, 3)}, "positions must be [position, 3] in metres, at least one; got [0, 3]"),
         ({"positions": torch.zeros(3)}, "positions must be [position, 3] in metres, at least one; got [3]"),
         ({"positions": torch.full((2, 3), math.nan)}, "positions must be finite"),
-        ({"pixel": 0.0}, "pixel must be positive [rad]"),
-        ({"pixel": math.nan}, "pixel must be positive [rad]"),
-        ({"flat": -1}, "flat and colour at least 0"),
+        ({"pixel": 0.0}, "pixel [rad] and widest [m] must be positive and finite; got 0.0 and 0.15"),
+        ({"widest": math.nan}, "pixel [rad] and widest [m] must be positive and finite"),
+        ({"flat": -1}, "flat and colour must be at least 0; got -1"),
         ({"margin": -0.1}, "margin must be at least 0 m; got -0.1"),
     ],
 )

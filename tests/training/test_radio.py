@@ -23,11 +23,11 @@ TX = torch.tensor([1.0, 1.2, 2.4])
 QUICK = RadioConfig(steps=12, backend="reference")
 
 
-def room() -> Gaussians:
+def room(spacing: float = 0.4) -> Gaussians:
     corner = [[HIGH[axis] if i >> axis & 1 else 0.0 for axis in range(3)] for i in range(8)]
     quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
     faces = [triangle for a, b, c, d in quads for triangle in ((a, b, c), (a, c, d))]
-    return sample_mesh(torch.tensor(corner), torch.tensor(faces), spacing=0.4, thickness=0.01)
+    return sample_mesh(torch.tensor(corner), torch.tensor(faces), spacing=spacing, thickness=0.01)
 
 
 def measure(pose: Pose, grid=None, *, lobe: float = math.radians(12)) -> Spectrum:
@@ -243,3 +243,16 @@ def test_bad_spectra_are_refused_by_position(training):
         fit_radio(room(), training, replace(QUICK, floor_db=-10.0))
     with pytest.raises(InputError, match=r"steps must be 0 .* or more; got -1"):
         fit_radio(room(), training, replace(QUICK, steps=-1))
+
+
+def test_merged_geometry_renders_what_the_whole_one_does():
+    geometry, truth = room(0.08), measure(positions(16, 5))
+    whole = fit_radio(geometry, truth, replace(QUICK, steps=0, backend="auto", detail="auto"))
+    merged = fit_radio(geometry, truth, replace(QUICK, steps=0, backend="auto", detail="merge"))
+    assert len(whole.surface) == len(geometry)
+    assert merged.meta["Gaussians given"] == len(geometry)
+    assert len(merged.surface) == len(merged.solidity) == len(merged.colour) < 0.5 * len(geometry)
+    held_out = measure(positions(4, 6))
+    errors = [level_error(field, held_out) for field in (whole, merged)]
+    assert errors[1] < 1.1 * errors[0]
+    assert torch.equal(merged.sees_transmitter(held_out.pose), whole.sees_transmitter(held_out.pose))

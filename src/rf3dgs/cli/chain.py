@@ -150,7 +150,7 @@ def report_inputs(
         "Training": f"{len(train)} positions, {len(dataset.train.photos)} photographs",
         "Instrument": field.instrument.name,
         "Grid": f"{train.grid.kind}, {train.grid.width} x {train.grid.height}",
-        "Gaussians": f"{len(field.surface):,}",
+        "Gaussians": gaussian_count(field),
         "Transmitter": "(" + ", ".join(f"{value:.2f}" for value in field.tx.position.tolist()) + ") m",
         "dB window": f"{field.window.floor_db:.1f} to {field.window.ceil_db:.1f} dB",
         "Path gain at the training positions": _range_db(train),
@@ -170,6 +170,13 @@ def report_inputs(
         command=command,
         window=field.window,
     )
+
+
+def gaussian_count(field: "RadioField") -> str:
+    """How many Gaussians a field has, and of how many given ones they were merged."""
+    count, given = len(field.surface), field.meta.get("Gaussians given")
+    merged = isinstance(given, int) and given != count
+    return f"{count:,}, merged from {given:,}" if merged else f"{count:,}"
 
 
 def _range_db(spectra: Spectrum) -> str:

@@ -145,6 +145,7 @@ def fit_field(
     """Train the radio stage with checkpoints, save the field, and say how large it is; `source` names the geometry."""
     from dataclasses import replace
 
+    from rf3dgs.cli.chain import gaussian_count
     from rf3dgs.training.radio import fit_radio
 
     check_output(path)
@@ -156,7 +157,7 @@ def fit_field(
     trained.save(path)
     drop_checkpoints(path)
     size = sum(file.stat().st_size for file in path.iterdir()) / 1e6
-    out(f"{path}: {len(trained.surface):,} Gaussians, {size:.1f} MB")
+    out(f"{path}: {gaussian_count(trained)} Gaussians, {size:.1f} MB")
 
 
 def check_output(path: Path) -> None:

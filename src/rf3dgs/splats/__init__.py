@@ -9,6 +9,9 @@ from rf3dgs.core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from rf3dgs.splats.density import DensityState as DensityState
+    from rf3dgs.splats.detail import Detail as Detail
+    from rf3dgs.splats.detail import level_of_detail as level_of_detail
+    from rf3dgs.splats.detail import prune_unseen as prune_unseen
     from rf3dgs.splats.gaussians import Gaussians as Gaussians
     from rf3dgs.splats.image_loss import l1_ssim as l1_ssim
     from rf3dgs.splats.image_loss import psnr as psnr
@@ -37,6 +40,9 @@ __all__ = [  # noqa: RUF022
     "Target",
     "Rates",
     "DensityState",
+    "Detail",
+    "level_of_detail",
+    "prune_unseen",
     "sample_mesh",
     "segment_transmittance",
     "read_ply",
@@ -57,6 +63,9 @@ __getattr__, __dir__ = lazy_names(
         "Target": ".target",
         "Rates": ".rates",
         "DensityState": ".density",
+        "Detail": ".detail",
+        "level_of_detail": ".detail",
+        "prune_unseen": ".detail",
         "sample_mesh": ".surface",
         "segment_transmittance": ".transmittance",
         "read_ply": ".ply",

@@ -5,6 +5,8 @@ its own: squares in the bin's plane, half as thick as wide. Their widths are pow
 cells nest in larger ones. Walls that meet at an edge belong to different bins and never share a cell.
 """
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -21,24 +23,25 @@ _BITS = 18  # of a cell's number along each axis
 _ALONG_U, _ALONG_V = 1 << (2 * _BITS), 1 << _BITS
 
 
-def shared_cells(gaussians: Gaussians, finest: Tensor, doublings: int, colour: float) -> Tensor:
+def shared_cells(gaussians: Gaussians, finest: Tensor, widest: float, doublings: int, colour: float) -> Tensor:
     """Numbers `[gaussian]` from 0 without gaps, equal for Gaussians that share a cell.
 
     `finest` `[gaussian]` [m] is the width below which nobody can tell a Gaussian from its neighbours. Cells may be
     wider by up to `doublings` factors of two where all four neighbouring cells hold Gaussians of like normals too and
-    the standard deviation of the constant colour is at most `colour`.
+    the standard deviation of the constant colour is at most `colour`; none is wider than `widest` [m].
     """
     bin_number, frame = _bins(normals(gaussians))
     means = gaussians.means.double()
     local = ((means - means.mean(0).round())[:, None] @ frame[bin_number]).squeeze(1)
     unit = FINEST * 2.0 ** float((local.abs().max() / (FINEST * 2 ** (_BITS - 3))).log2().ceil().clamp_min(0))
-    low = (finest.double() / unit).clamp_min(1.0).log2().floor().long()
+    low = (finest.double().clamp_max(widest) / unit).clamp_min(1.0).log2().floor().long()
+    high = (low + doublings).clamp_max(max(0, math.floor(math.log2(widest / unit))))
     largest, shade = gaussians.scales.amax(-1), gaussians.sh[:, 0].double() * C0
     cluster = torch.full((len(gaussians),), -1, dtype=torch.long)
     made = 0
-    for level in range(int(low.max()) + doublings, int(low.min()) - 1, -1):
+    for level in range(int(high.max()), int(low.min()) - 1, -1):
         width = unit * 2.0**level
-        fits = (cluster < 0) & (low <= level) & (low + doublings >= level) & (largest <= OWN * width)
+        fits = (cluster < 0) & (low <= level) & (high >= level) & (largest <= OWN * width)
         some = fits.nonzero().squeeze(-1)
         if len(some) == 0:
             continue

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rf3dgs.core.cube import face_cameras
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import matrix_from_quaternion, quaternion_from_matrix
-from rf3dgs.core.grids import Camera
+from rf3dgs.core.grids import Camera, View
 from rf3dgs.splats.backends.native import raise_to_weights_native
 from rf3dgs.splats.cells import shared_cells
 from rf3dgs.splats.gaussians import Gaussians
@@ -65,11 +66,11 @@ class Detail:
 
 
 @torch.no_grad()
-def largest_weights(gaussians: Gaussians, views: Sequence[Camera], *, backend: Backend = "auto") -> Tensor:
+def largest_weights(gaussians: Gaussians, views: Sequence[View], *, backend: Backend = "auto") -> Tensor:
     """The largest blending weight `[gaussian]`, 0..1, that each Gaussian has in any pixel of any view.
 
-    The native core finds it in the forward pass. Other backends draw a channel for each Gaussian, which is for small
-    scenes and the specification.
+    The native core finds it in the forward pass, of a panorama through its cube faces. Other backends draw a channel
+    for each Gaussian, which is for small scenes and the specification.
     """
     now = gaussians.detach()
     shape = now.means, now.quats, now.scales, now.opacities
@@ -77,7 +78,8 @@ def largest_weights(gaussians: Gaussians, views: Sequence[Camera], *, backend: B
     native = (pick_backend()[0] if backend == "auto" else backend) == "native"
     for view in views:
         if native:
-            raise_to_weights_native(largest, shape, view)
+            for camera in [view] if isinstance(view, Camera) else face_cameras(view.pose, -(-view.width // 4)):
+                raise_to_weights_native(largest, shape, camera)
             continue
         for some in torch.arange(len(now)).split(CHANNELS):
             one = torch.zeros(len(now), len(some)).index_put_((some, torch.arange(len(some))), torch.ones(len(some)))
@@ -87,7 +89,7 @@ def largest_weights(gaussians: Gaussians, views: Sequence[Camera], *, backend: B
 
 
 def prune_unseen(
-    gaussians: Gaussians, views: Sequence[Camera], *, keep_weight: float = 0.01, backend: Backend = "auto"
+    gaussians: Gaussians, views: Sequence[View], *, keep_weight: float = 0.01, backend: Backend = "auto"
 ) -> Detail:
     """Remove the Gaussians whose blending weight stays below `keep_weight` in every pixel of every one of `views`.
 
@@ -116,6 +118,7 @@ def level_of_detail(
     *,
     pixel: float,
     flat: int = 2,
+    widest: float = 0.15,
     colour: float = 0.05,
     margin: float | None = None,
 ) -> Detail:
@@ -123,9 +126,9 @@ def level_of_detail(
 
     A Gaussian may merge with those of like normals (about 20 degrees) in a cell as wide as a pixel at the nearest
     position, and in cells wider by up to `flat` factors of two where the surface goes on to all sides and the standard
-    deviation of the constant colour is at most `colour`. `margin` [m] is how much nearer new positions may come (at
-    most to half the distance); None takes half the mean distance of neighbouring positions. Gaussians larger than their
-    cell, and those alone in it, stay as they are.
+    deviation of the constant colour is at most `colour`. No cell is wider than `widest` [m]. `margin` [m] is how much
+    nearer new positions may come (at most to half the distance); None takes half the mean distance of neighbouring
+    positions. Gaussians larger than their cell, and those alone in it, stay as they are.
 
     A merged Gaussian has its members' mean and covariance, weighted by opacity times area, and the weighted mean of
     their harmonics. Its opacity keeps their optical thickness, the sum of opacity times area; where that would exceed
@@ -134,9 +137,11 @@ def level_of_detail(
     """
     gaussians.check()
     finest = pixel * _distance(gaussians.means, positions, margin)
-    if not pixel > 0 or flat < 0 or not colour >= 0:
-        raise InputError(f"pixel must be positive [rad], flat and colour at least 0; got {pixel}, {flat} and {colour}")
-    cluster = shared_cells(gaussians, finest, flat, colour)
+    if not (0 < pixel < math.inf and 0 < widest < math.inf):
+        raise InputError(f"pixel [rad] and widest [m] must be positive and finite; got {pixel} and {widest}")
+    if flat < 0 or not colour >= 0:
+        raise InputError(f"flat and colour must be at least 0; got {flat} and {colour}")
+    cluster = shared_cells(gaussians, finest, widest, flat, colour)
     return _merge(gaussians.detach(), cluster)
 
 

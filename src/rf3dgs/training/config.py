@@ -30,6 +30,10 @@ class RadioConfig:
     ceil_db: float | None = None
     """Upper end of the field's dB window; None puts it above the largest training peak."""
 
+    detail: Literal["auto", "merge", "keep"] = "auto"
+    """Level of detail: "merge" merges the Gaussians that the spectra's pixels cannot tell apart before training, "auto"
+    does so when there are more than 150,000, "keep" never."""
+
     start: Literal["ridge", "mean", "grey"] = "ridge"
     """Initial harmonics: "ridge" solves them per Gaussian by regularised least squares on the back-projected spectra,
     "mean" takes the mean back-projected level, "grey" is the paper's 0.5 everywhere."""

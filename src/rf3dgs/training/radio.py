@@ -19,6 +19,7 @@ from rf3dgs.field.radio_field import RadioField
 from rf3dgs.field.sources import Blockers, PointSource, estimate_transmitter, fit_line_of_sight, fit_opening
 from rf3dgs.spectra.codec import DbWindow, PaperEncoding, window_of
 from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.splats.detail import level_of_detail
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import C0
 from rf3dgs.training.checkpoint import fingerprint
@@ -26,6 +27,8 @@ from rf3dgs.training.config import RadioConfig
 from rf3dgs.training.loop import train
 from rf3dgs.training.radio_stage import RadioStage
 from rf3dgs.training.radio_views import radio_views
+
+MANY = 150_000  # Gaussians beyond which their level of detail is worth its pass
 
 
 def fit_radio(
@@ -40,8 +43,9 @@ def fit_radio(
     """Train a field on `spectra` `[position, row, col]` over frozen `geometry`.
 
     `tx` is the transmitter's pose; None takes that of the spectra, or estimates its position from the strongest
-    bearings. With a `checkpoint_dir` a killed run goes on where it stopped and ends with the same bits. Raises
-    InputError for spectra that are empty, constant or not finite, and TrainingError when training cannot go on.
+    bearings. More Gaussians than the spectra can tell apart are merged first, as `config.detail` says. With a
+    `checkpoint_dir` a killed run goes on where it stopped and ends with the same bits. Raises InputError for spectra
+    that are empty, constant or not finite, and TrainingError when training cannot go on.
     """
     config = RadioConfig() if config is None else config
     progress = Silent() if progress is None else progress
@@ -49,6 +53,7 @@ def fit_radio(
         raise InputError(f"steps must be 0 (the closed-form start alone) or more; got {config.steps}")
     geometry.check()
     check_spectra(spectra)
+    given, geometry = len(geometry), _detail(geometry, spectra, config)
     where = spectra.tx if tx is None else tx
     estimated = where is None
     where = estimate_transmitter(spectra) if where is None else where
@@ -100,6 +105,7 @@ def fit_radio(
         "positions": len(spectra),
         "transmitter": "estimated" if estimated else "given",
         "positions in sight": int(seen.sum()),
+        "Gaussians given": given,
     }
     return RadioField(
         surface=stage.surface(),
@@ -134,6 +140,14 @@ def check_spectra(spectra: Spectrum, numbers: Tensor | None = None) -> None:
             first = int(wrong.nonzero()[0])
             number = first if numbers is None else int(numbers[first])
             raise InputError(f"the spectrum of position {number} {text}; remove or repair it")
+
+
+def _detail(geometry: Gaussians, spectra: Spectrum, config: RadioConfig) -> Gaussians:
+    """The geometry, merged where a pixel of the spectra, or half a lobe of their instrument, cannot tell it apart."""
+    if config.detail == "keep" or (config.detail == "auto" and len(geometry) <= MANY):
+        return geometry
+    pixel = max(spectra.grid.spacing, 0.5 * spectra.instrument.lobe)
+    return level_of_detail(geometry, spectra.pose.position, pixel=pixel).gaussians
 
 
 def _window(spectra: Spectrum, config: RadioConfig) -> DbWindow:
