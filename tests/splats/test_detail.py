@@ -37,7 +37,7 @@ def weight_of(gaussians: Gaussians, position: tuple, target: tuple, size: int = 
 
 def test_a_closed_wall_stays_closed_with_a_tenth_of_the_gaussians():
     before = wall()
-    after = level_of_detail(before, torch.tensor([[0.0, 0.0, 2.0]]), pixel=PIXEL, margin=0.0).gaussians
+    after = level_of_detail(before, torch.tensor([[0.0, 0.0, 2.0]]), pixel=PIXEL, widest=0.2).gaussians
     assert len(after) < 0.1 * len(before)
     assert weight_of(after, (0.0, 0.01, 2.0), (0.0, 0.0, 0.0)).min() > 0.99
 
@@ -125,7 +125,7 @@ def test_the_result_does_not_depend_on_the_order():
 def test_nearer_positions_and_margins_keep_more():
     before = wall()
     counts = [
-        len(level_of_detail(before, torch.tensor([[0.0, 0.0, z]]), pixel=PIXEL, margin=margin).gaussians)
+        len(level_of_detail(before, torch.tensor([[0.0, 0.0, z]]), pixel=PIXEL, widest=1.0, margin=margin).gaussians)
         for z, margin in ((4.0, 0.0), (2.0, 0.0), (1.0, 0.0), (1.0, 0.3))
     ]
     assert counts[0] < counts[1] < counts[2] < counts[3] <= len(before)
@@ -134,11 +134,11 @@ def test_nearer_positions_and_margins_keep_more():
 def test_two_colours_share_no_cell_wider_than_a_pixel():
     before = wall()
     before.sh[:, 0] = torch.where(before.means[:, :1] > 0.013, 1.0, -1.0)
-    detail = level_of_detail(before, torch.tensor([[0.0, 0.0, 4.0]]), pixel=PIXEL, margin=0.0)
+    detail = level_of_detail(before, torch.tensor([[0.0, 0.0, 4.0]]), pixel=PIXEL, widest=1.0)
     mixed = (detail.gaussians.sh[:, 0, 0].abs() < 0.99)[detail.cluster]
     assert mixed.any()
     assert (before.means[mixed, 0] - 0.013).abs().max() < PIXEL * before.means[mixed].norm(dim=-1).add(4.0).max()
-    plain = level_of_detail(wall(), torch.tensor([[0.0, 0.0, 4.0]]), pixel=PIXEL, margin=0.0)
+    plain = level_of_detail(wall(), torch.tensor([[0.0, 0.0, 4.0]]), pixel=PIXEL, widest=1.0)
     assert len(detail.gaussians) > len(plain.gaussians)
 
 
@@ -163,7 +163,7 @@ def test_harmonics_are_carried_both_ways():
         ({"positions": torch.zeros(0, 3)}, "positions must be [position, 3] in metres, at least one; got [0, 3]"),
         ({"positions": torch.zeros(3)}, "positions must be [position, 3] in metres, at least one; got [3]"),
         ({"positions": torch.full((2, 3), math.nan)}, "positions must be finite"),
-        ({"pixel": 0.0}, "pixel [rad] and widest [m] must be positive and finite; got 0.0 and 0.15"),
+        ({"pixel": 0.0}, "pixel [rad] and widest [m] must be positive and finite; got 0.0 and 0.1"),
         ({"widest": math.nan}, "pixel [rad] and widest [m] must be positive and finite"),
         ({"flat": -1}, "flat and colour must be at least 0; got -1"),
         ({"margin": -0.1}, "margin must be at least 0 m; got -0.1"),

@@ -28,14 +28,14 @@ def shared_cells(gaussians: Gaussians, finest: Tensor, widest: float, doublings:
 
     `finest` `[gaussian]` [m] is the width below which nobody can tell a Gaussian from its neighbours. Cells may be
     wider by up to `doublings` factors of two where all four neighbouring cells hold Gaussians of like normals too and
-    the standard deviation of the constant colour is at most `colour`; none is wider than `widest` [m].
+    the standard deviation of the constant colour is at most `colour`, but no wider than `widest` [m].
     """
     bin_number, frame = _bins(normals(gaussians))
     means = gaussians.means.double()
     local = ((means - means.mean(0).round())[:, None] @ frame[bin_number]).squeeze(1)
     unit = FINEST * 2.0 ** float((local.abs().max() / (FINEST * 2 ** (_BITS - 3))).log2().ceil().clamp_min(0))
-    low = (finest.double().clamp_max(widest) / unit).clamp_min(1.0).log2().floor().long()
-    high = (low + doublings).clamp_max(max(0, math.floor(math.log2(widest / unit))))
+    low = (finest.double() / unit).clamp_min(1.0).log2().floor().long()
+    high = torch.maximum(low, (low + doublings).clamp_max(math.floor(math.log2(widest / unit))))
     largest, shade = gaussians.scales.amax(-1), gaussians.sh[:, 0].double() * C0
     cluster = torch.full((len(gaussians),), -1, dtype=torch.long)
     made = 0

@@ -22,9 +22,9 @@ from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.rasterize import Backend, pick_backend, rasterize
 from rf3dgs.splats.surface import normals
 
-DENSEST = 0.98  # largest opacity of a merged Gaussian; what does not fit in makes it wider
-WIDEST = 2.4  # by at most this factor: the members fill a square cell with a deviation of 0.29 of its width, a closed
-# lattice needs 0.7
+DENSEST = 0.99  # largest opacity of a merged Gaussian, as of any in a picture; what does not fit in makes it wider
+WIDEST = 2.4  # by at most this factor: members that fill a square deviate by 0.29 of its side, and squares side by side
+# hide what is behind them when the Gaussians in them deviate by 0.7
 CHANNELS = 64  # of a picture that shows one Gaussian in each
 NEAREST = 0.5  # the margin of new positions takes at most this share of a distance
 
@@ -117,22 +117,23 @@ def level_of_detail(
     positions: Tensor,
     *,
     pixel: float,
-    flat: int = 2,
-    widest: float = 0.15,
+    flat: int = 3,
+    widest: float = 0.1,
     colour: float = 0.05,
     margin: float | None = None,
 ) -> Detail:
     """Merge Gaussians that pictures with pixels of `pixel` [rad] at `positions` `[position, 3]` [m] do not tell apart.
 
     A Gaussian may merge with those of like normals (about 20 degrees) in a cell as wide as a pixel at the nearest
-    position, and in cells wider by up to `flat` factors of two where the surface goes on to all sides and the standard
-    deviation of the constant colour is at most `colour`. No cell is wider than `widest` [m]. `margin` [m] is how much
-    nearer new positions may come (at most to half the distance); None takes half the mean distance of neighbouring
-    positions. Gaussians larger than their cell, and those alone in it, stay as they are.
+    position, and in cells wider by up to `flat` factors of two and up to `widest` [m] where the surface goes on to all
+    sides and the standard deviation of the constant colour is at most `colour`. Widths are rounded down to powers of
+    two of a millimetre. `margin` [m] is how much nearer new positions may come (at most to half the distance); None
+    takes half the mean distance of neighbouring positions. Gaussians larger than their cell, and those alone in it,
+    stay as they are.
 
     A merged Gaussian has its members' mean and covariance, weighted by opacity times area, and the weighted mean of
     their harmonics. Its opacity keeps their optical thickness, the sum of opacity times area; where that would exceed
-    0.98 it becomes wider instead. The order of the Gaussians does not matter, and the same ones give the same
+    0.99 it becomes wider instead. The order of the Gaussians does not matter, and the same ones give the same
     result. Raises InputError for Gaussians that are not finite and positions that are none.
     """
     gaussians.check()

@@ -1,0 +1,169 @@
+"""What the level of detail costs and saves: a million Gaussians against their merged version.
+
+    python -m benchmarks.quality.detail [--gaussians 1000000] [--held-out 4] [--pixel 1.0] [--json FILE]
+
+Three scenes: the built-in lobby sampled from its mesh, the room of the speed benchmarks with walls closed (Gaussians
+of twice the size), and that room as it is, which one sees through. All carry a smooth gain: harmonics of degree 3
+that vary over metres, another level for each direction of a wall and, in the lobby, for each colour. The merged
+version carries the mean harmonics, as nothing was trained on it. Pictures are taken at positions that merging did not
+know: pinholes of 300x200 over 90 degrees and spheres of 360x180. Errors are shares of the dB window (harmonics give
+window units); depths are means over the weight. Times are CPU times (least of the repetitions) of one thread,
+averaged over the pinholes: a render of one channel, and a step with frozen geometry (harmonics, forward, L1 + D-SSIM,
+backward, Adam), through autograd.
+"""
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from benchmarks.speed.scenes import room
+from rf3dgs.cli.facts import open_scene
+from rf3dgs.core.files import write_whole
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import View, equirect_grid, pinhole_grid, view_of
+from rf3dgs.splats.detail import level_of_detail
+from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.splats.harmonics import view_values
+from rf3dgs.splats.image_loss import l1_ssim
+from rf3dgs.splats.rasterize import rasterize
+from rf3dgs.splats.surface import normals, sample_mesh
+
+POSITIONS = 80  # that merging knows
+
+
+def smooth_gain(gaussians: Gaussians, seed: int = 3) -> Tensor:
+    """Degree-3 harmonics `[gaussian, 16, 1]` that vary over 1 to 4 m, with another level for each normal and colour."""
+    generator = torch.Generator().manual_seed(seed)
+    means, result = gaussians.means, torch.zeros(len(gaussians), 16, 1)
+    for k in range(16):
+        wave = torch.zeros(len(means))
+        for _ in range(4):
+            along = torch.nn.functional.normalize(torch.randn(3, generator=generator), dim=0)
+            length, phase = 1 + 3 * torch.rand((), generator=generator), torch.rand((), generator=generator)
+            wave += 0.5 * torch.sin(2 * math.pi * ((means @ along) / length + phase))
+        result[:, k, 0] = wave * (0.35 if k == 0 else 0.12 / (1 + math.isqrt(k)))
+    result[:, 0, 0] += 0.17 * (normals(gaussians) @ torch.tensor([1.0, 0.6, 0.3]))
+    result[:, 0, 0] += 0.3 * gaussians.sh[:, 0].mean(-1)
+    return result
+
+
+def scenes(count: int) -> dict[str, Gaussians]:
+    """The three scenes with their gain."""
+    vertices, faces, colours = open_scene("lobby").mesh()
+    lobby = sample_mesh(vertices, faces, count=count, colours=colours)
+    speed = room(count, channels=1)
+    tensors = {name: speed[name] for name in ("means", "quats")} | {
+        "log_scales": speed["scales"].log(),
+        "logit_opacities": torch.logit(speed["opacities"]),
+        "sh": torch.zeros(count, 1, 1),
+    }
+    porous = Gaussians(**tensors)
+    closed = Gaussians(**(tensors | {"log_scales": tensors["log_scales"] + math.log(2.0)}))
+    found = {"lobby": lobby, "room, closed": closed, "room, porous": porous}
+    return {name: Gaussians(**(one.tensors() | {"sh": smooth_gain(one)})) for name, one in found.items()}
+
+
+def draw(gaussians: Gaussians, view: View) -> Tensor:
+    """Gain, depth over the weight [m] and weight `[row, col, 3]`."""
+    gain = view_values(gaussians.sh, gaussians.means, view.position, offset=0.5)
+    depth = torch.linalg.vector_norm(gaussians.means - view.position, dim=-1, keepdim=True)
+    shape = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
+    raster = rasterize(*shape, torch.cat((gain, depth), -1), view)
+    weight = raster.weight[..., None]
+    return torch.cat((raster.values[..., :1], raster.values[..., 1:] / weight.clamp_min(1e-3), weight), -1)
+
+
+def compare(whole: Gaussians, merged: Gaussians, views: Sequence[View]) -> dict[str, float]:
+    """Errors over all pixels of all views, a pixel weighing its solid angle."""
+    error, weight = [], []
+    for view in views:
+        error.append((draw(merged, view) - draw(whole, view)).flatten(0, 1))
+        weight.append(view.grid.solid_angle.flatten())
+    difference, share = torch.cat(error).double(), torch.cat(weight).double()
+    share /= share.sum()
+    gain, depth, blended = difference.unbind(-1)
+    return {
+        "mean_percent": 100 * float((share * gain.abs()).sum()),
+        "rmse_percent": 100 * float((share * gain.square()).sum().sqrt()),
+        "weight": float((share * blended).sum()),
+        "depth_cm": 100 * float((share * depth.abs()).sum()),
+    }
+
+
+def cpu_ms(work: Callable[[], object], repetitions: int = 8) -> float:
+    """Least CPU time of a call [ms]."""
+    times = []
+    for _ in range(repetitions):
+        started = time.process_time()
+        work()
+        times.append(1e3 * (time.process_time() - started))
+    return min(times)
+
+
+def costs(gaussians: Gaussians, views: Sequence[View]) -> dict[str, float]:
+    """Mean CPU times [ms] of a render and of a step with frozen geometry."""
+    shape, sh = (gaussians.means, gaussians.quats, gaussians.scales), gaussians.sh.clone().requires_grad_()
+    logit = gaussians.logit_opacities.clone().requires_grad_()
+    optimiser = torch.optim.Adam([logit, sh], lr=1e-3)
+    total = {"render_ms": 0.0, "step_ms": 0.0}
+    for view in views:
+        gain = view_values(gaussians.sh, gaussians.means, view.position, offset=0.5)
+        target = torch.full((view.height, view.width, 1), 0.5)
+
+        def step(view: View = view, target: Tensor = target) -> None:
+            optimiser.zero_grad(set_to_none=True)
+            values = view_values(sh, gaussians.means, view.position, offset=0.5)
+            l1_ssim(rasterize(*shape, torch.sigmoid(logit), values, view).values, target).backward()
+            optimiser.step()
+
+        drawn = (*shape, gaussians.opacities, gain, view)
+        total["render_ms"] += cpu_ms(lambda drawn=drawn: rasterize(*drawn)) / len(views)
+        total["step_ms"] += cpu_ms(step, 3) / len(views)
+    return total
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--gaussians", type=int, default=1_000_000)
+    parser.add_argument("--held-out", type=int, default=4, help="positions at which pictures are compared")
+    parser.add_argument("--pixel", type=float, default=1.0, help="[deg]")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    places = open_scene("lobby").receivers(POSITIONS + options.held_out, 0).position
+    aims = [2.4 * number for number in range(options.held_out)]
+    poses = [
+        Pose.look_at(tuple(here), (here[0] + math.cos(aim), here[1] + math.sin(aim), here[2] - 0.1))
+        for here, aim in zip(places[POSITIONS:].tolist(), aims, strict=True)
+    ]
+    pinholes = [view_of(pose, pinhole_grid(300, 200, 90.0)) for pose in poses]
+    spheres = [view_of(pose, equirect_grid(360, 180)) for pose in poses]
+    result: dict[str, object] = {"pixel_deg": options.pixel, "positions": POSITIONS, "held_out": options.held_out}
+    for name, whole in scenes(options.gaussians).items():
+        started = time.process_time()
+        merged = level_of_detail(whole, places[:POSITIONS], pixel=math.radians(options.pixel)).gaussians
+        seconds = time.process_time() - started
+        row: dict[str, object] = {"whole": len(whole), "merged": len(merged), "seconds": seconds}
+        print(f"{name}: {len(whole):,} -> {len(merged):,} Gaussians in {seconds:.1f} s CPU")
+        for kind, views in (("pinhole", pinholes), ("sphere", spheres)):
+            row[kind] = error = compare(whole, merged, views)
+            print(
+                f"  {kind}: gain error mean {error['mean_percent']:.2f} %, RMSE {error['rmse_percent']:.2f} % of the "
+                f"window; weight {error['weight']:+.4f}; depth {error['depth_cm']:.1f} cm"
+            )
+        for kind, gaussians in (("whole", whole), ("merged", merged)):
+            row[f"{kind} cost"] = cost = costs(gaussians, pinholes)
+            print(f"  {kind}: render {cost['render_ms']:.1f} ms CPU, frozen step {cost['step_ms']:.1f} ms CPU")
+        result[name] = row
+    if options.json is not None:
+        write_whole(options.json, (json.dumps(result, indent=2) + "\n").encode())
+
+
+if __name__ == "__main__":
+    main()
