@@ -7,22 +7,22 @@ of twice the size), and that room as it is, which one sees through. All carry a 
 that vary over metres, another level for each direction of a wall and, in the lobby, for each colour. The merged
 version carries the mean harmonics, as nothing was trained on it. Pictures are taken at positions that merging did not
 know: pinholes of 300x200 over 90 degrees and spheres of 360x180. Errors are shares of the dB window (harmonics give
-window units); depths are means over the weight. Times are CPU times (least of the repetitions) of one thread,
-averaged over the pinholes: a render of one channel, and a step with frozen geometry (harmonics, forward, L1 + D-SSIM,
-backward, Adam), through autograd.
+window units); depths are means over the weight. Times are CPU times of all threads, the mean over the pinholes of each
+one's least: a picture of one channel, harmonics included, and a training step with frozen geometry.
 """
 
 import argparse
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from benchmarks.speed.scenes import room
+from benchmarks.speed.timing import measure
 from rf3dgs.cli.facts import open_scene
 from rf3dgs.core.files import write_whole
 from rf3dgs.core.frames import Pose
@@ -30,9 +30,11 @@ from rf3dgs.core.grids import View, equirect_grid, pinhole_grid, view_of
 from rf3dgs.splats.detail import level_of_detail
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import view_values
-from rf3dgs.splats.image_loss import l1_ssim
 from rf3dgs.splats.rasterize import rasterize
+from rf3dgs.splats.rates import Rates
 from rf3dgs.splats.surface import normals, sample_mesh
+from rf3dgs.splats.target import Target
+from rf3dgs.splats.trainer import Trainer
 
 POSITIONS = 80  # that merging knows
 
@@ -96,36 +98,14 @@ def compare(whole: Gaussians, merged: Gaussians, views: Sequence[View]) -> dict[
     }
 
 
-def cpu_ms(work: Callable[[], object], repetitions: int = 8) -> float:
-    """Least CPU time of a call [ms]."""
-    times = []
-    for _ in range(repetitions):
-        started = time.process_time()
-        work()
-        times.append(1e3 * (time.process_time() - started))
-    return min(times)
-
-
 def costs(gaussians: Gaussians, views: Sequence[View]) -> dict[str, float]:
-    """Mean CPU times [ms] of a render and of a step with frozen geometry."""
-    shape, sh = (gaussians.means, gaussians.quats, gaussians.scales), gaussians.sh.clone().requires_grad_()
-    logit = gaussians.logit_opacities.clone().requires_grad_()
-    optimiser = torch.optim.Adam([logit, sh], lr=1e-3)
-    total = {"render_ms": 0.0, "step_ms": 0.0}
-    for view in views:
-        gain = view_values(gaussians.sh, gaussians.means, view.position, offset=0.5)
-        target = torch.full((view.height, view.width, 1), 0.5)
-
-        def step(view: View = view, target: Tensor = target) -> None:
-            optimiser.zero_grad(set_to_none=True)
-            values = view_values(sh, gaussians.means, view.position, offset=0.5)
-            l1_ssim(rasterize(*shape, torch.sigmoid(logit), values, view).values, target).backward()
-            optimiser.step()
-
-        drawn = (*shape, gaussians.opacities, gain, view)
-        total["render_ms"] += cpu_ms(lambda drawn=drawn: rasterize(*drawn)) / len(views)
-        total["step_ms"] += cpu_ms(step, 3) / len(views)
-    return total
+    """CPU times [ms] of a picture and of a training step with frozen geometry, one channel, mean over the views."""
+    trainer = Trainer(*gaussians.tensors().values())
+    targets = [Target(torch.full((view.height, view.width, 1), 0.5)) for view in views]
+    rates = Rates(logit_opacities=1e-4, level=1e-4, bands=1e-4)
+    drawing = measure(lambda view: trainer.draw(views[view]), len(views), rounds=8)
+    training = measure(lambda view: trainer.step(views[view], targets[view], rates), len(views), rounds=8)
+    return {"render_ms": drawing.cpu_min, "step_ms": training.cpu_min}
 
 
 def main() -> None:

@@ -176,7 +176,7 @@ def gaussian_count(field: "RadioField") -> str:
     """How many Gaussians a field has, and of how many given ones they were merged."""
     count, given = len(field.surface), field.meta.get("Gaussians given")
     merged = isinstance(given, int) and given != count
-    return f"{count:,}, merged from {given:,}" if merged else f"{count:,}"
+    return f"{count:,} merged from {given:,}" if merged else f"{count:,}"
 
 
 def _range_db(spectra: Spectrum) -> str:
