@@ -210,15 +210,16 @@ void order_of(In<-1, 3> means, nb::ndarray<int32_t, nb::shape<-1>, nb::c_contig,
 }
 
 void draw_plain(In<-1, 3> means, In<-1, 4> quats, In<-1, 3> log_scales, In<-1> logits, In<-1, -1, -1> sh, float offset,
-                bool clamp, In<4, 4> viewmat, std::optional<In<3, 3>> camera, int width, int height,
+                bool clamp, In<4, 4> viewmat, std::optional<In<3, 3>> camera, int width, int height, int bases,
                 std::optional<In<-1, -1>> extra, bool depth, std::optional<In<-1>> background,
                 std::optional<float> gate, bool normalise, std::vector<bool> in_window, double floor_db, double ceil_db,
                 std::optional<In<-1, -1, -1>> added, Out<-1, -1, -1> picture, Out<-1, -1> weight, Out<-1> radii,
                 int threads) {
   const size_t count = means.shape(0);
-  const int channels = static_cast<int>(sh.shape(2)), bases = static_cast<int>(sh.shape(1));
+  const int channels = static_cast<int>(sh.shape(2));
   require(quats.shape(0) == count && log_scales.shape(0) == count && logits.shape(0) == count && sh.shape(0) == count &&
-              radii.shape(0) == count && channels > 0 && (bases == 1 || bases == 4 || bases == 9 || bases == 16),
+              radii.shape(0) == count && channels > 0 && sh.shape(1) == static_cast<size_t>(bases) &&
+              (bases == 1 || bases == 4 || bases == 9 || bases == 16),
           "all arrays need one row per Gaussian, harmonics 1, 4, 9 or 16 coefficients");
   const auto wishes = wishes_of(viewmat, camera, width, height, count, channels, extra, depth, background, gate,
                                 normalise, in_window, floor_db, ceil_db, added);

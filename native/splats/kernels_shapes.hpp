@@ -1,6 +1,4 @@
-// Adam for shape and opacity of Gaussians that a view drew, and how these are activated.
-//
-// The eleven numbers of a Gaussian are packed into one vector, so that their exponentials are taken together.
+// Adam for shape and opacity of Gaussians that a view drew, sixteen at a time, and how these are activated.
 #pragma once
 
 #include "core/vector.hpp"
@@ -15,80 +13,85 @@ using namespace rf3dgs;
 RF_INLINE Vec exponential(Vec x) { return exp2_vec(min_vec(x * 1.44269504088896341f, splat_vec(127.0f))); }
 RF_INLINE Vec sigmoid(Vec x) { return 1.0f / (1.0f + exponential(0.0f - x)); }
 
-// Lanes of a packed row.
-constexpr int kMean = 0, kQuat = 3, kScale = 7, kOpacity = 10, kShape = 11;
-
-// One packed row of an array's parts, its values or one of its moments.
+// One column of arrays [gaussian, columns], of sixteen Gaussians.
 template <class Number>
-struct Packed {
-  alignas(64) Number lane[kLanes] = {};
+struct Column {
+  alignas(64) Number lane[kLanes];
 
-  RF_INLINE void take(const void* from, size_t source, int columns, int at) {
-    if (from == nullptr) return;
-    std::memcpy(lane + at, static_cast<const Number*>(from) + source * columns, columns * sizeof(Number));
+  RF_INLINE void take(const Number* from, const size_t* rows, int columns) {
+    for (int at = 0; at < kLanes; ++at) lane[at] = from[rows[at] * columns];
   }
-  RF_INLINE void give(void* to, size_t source, int columns, int at) const {
-    if (to == nullptr) return;
-    std::memcpy(static_cast<Number*>(to) + source * columns, lane + at, columns * sizeof(Number));
+  RF_INLINE void give(Number* to, const size_t* rows, int lanes, int columns) const {
+    for (int at = 0; at < lanes; ++at) to[rows[at] * columns] = lane[at];
   }
 };
+
+// Sixteen Gaussians or fewer: their rows among all, and their rows among the gradients.
+struct Group {
+  size_t rows[kLanes], places[kLanes];
+  int lanes;
+};
+
+// One step for a column of a parameter; returns its new values.
+template <class Moment>
+RF_INLINE Vec adam_column(const Adam& adam, const Trained& array, int columns, int column, const Group& group, Vec gradient,
+                          float rate) {
+  Column<float> value;
+  Column<Moment> first, second;
+  Moment *const firsts = static_cast<Moment*>(array.first) + column, *const seconds = static_cast<Moment*>(array.second) + column;
+  value.take(array.value + column, group.rows, columns);
+  first.take(firsts, group.rows, columns);
+  second.take(seconds, group.rows, columns);
+  Vec m = load_moment(first.lane), v = load_moment(second.lane);
+  const Vec moved = adam.step(load(value.lane), m, v, gradient, splat_vec(rate));
+  store(value.lane, moved);
+  store_moment(first.lane, m);
+  store_moment(second.lane, v);
+  value.give(array.value + column, group.rows, group.lanes, columns);
+  first.give(firsts, group.rows, group.lanes, columns);
+  second.give(seconds, group.rows, group.lanes, columns);
+  return moved;
+}
+
+RF_INLINE Vec column_of(const float* from, const size_t* rows, int columns, int column) {
+  Column<float> result;
+  result.take(from + column, rows, columns);
+  return load(result.lane);
+}
 
 template <class Moment>
 void update_shapes_with(const ShapeUpdate& update, const Adam& adam, const uint32_t* sources, size_t count,
                         const float* means, const float* quats, const float* scales, const float* opacities) {
-  struct Part {
-    Trained array;
-    int columns, at;
-  };
-  const Part parts[4] = {{update.means, 3, kMean},
-                         {update.quats, 4, kQuat},
-                         {update.log_scales, 3, kScale},
-                         {update.logit_opacities, 1, kOpacity}};
-  Packed<float> rates;
-  for (int at = 0; at < 3; ++at) rates.lane[kMean + at] = update.rate_means;
-  for (int at = 0; at < 4; ++at) rates.lane[kQuat + at] = update.rate_quats;
-  for (int at = 0; at < 3; ++at) rates.lane[kScale + at] = update.rate_log_scales;
-  rates.lane[kOpacity] = update.rate_opacity;
-  const bool geometry = update.means.value != nullptr, opacity = update.logit_opacities.value != nullptr;
-  for (size_t at = 0; at < count; ++at) {
-    const size_t source = sources[at];
-    Packed<float> value, gradient;
-    Packed<Moment> first, second;
-    for (const Part& part : parts) {
-      value.take(part.array.value, source, part.columns, part.at);
-      first.take(part.array.first, source, part.columns, part.at);
-      second.take(part.array.second, source, part.columns, part.at);
+  Group group;
+  for (size_t start = 0; start < count; start += kLanes) {
+    group.lanes = static_cast<int>(count - start < kLanes ? count - start : kLanes);
+    for (int lane = 0; lane < kLanes; ++lane) {
+      group.places[lane] = start + (lane < group.lanes ? lane : 0);
+      group.rows[lane] = sources[group.places[lane]];
     }
-    if (geometry) {
-      gradient.take(means, at, 3, kMean);
-      gradient.take(quats, at, 4, kQuat);
-      for (int axis = 0; axis < 3; ++axis) {
-        gradient.lane[kScale + axis] = scales[3 * at + axis] * update.scales[3 * source + axis];
-      }
+    Column<float> active;
+    if (update.logit_opacities.value != nullptr) {
+      const Vec now = column_of(update.opacities, group.rows, 1, 0);
+      const Vec gradient = column_of(opacities, group.places, 1, 0) * now * (1.0f - now);
+      const Vec moved = adam_column<Moment>(adam, update.logit_opacities, 1, 0, group, gradient, update.rate_opacity);
+      store(active.lane, sigmoid(moved));
+      active.give(update.opacities, group.rows, group.lanes, 1);
     }
-    if (opacity) {
-      const float now = update.opacities[source];
-      gradient.lane[kOpacity] = opacities[at] * now * (1.0f - now);
+    if (update.means.value == nullptr) continue;
+    for (int axis = 0; axis < 3; ++axis) {
+      const Vec gradient = column_of(means, group.places, 3, axis);
+      adam_column<Moment>(adam, update.means, 3, axis, group, gradient, update.rate_means);
     }
-    Vec m = load_moment(first.lane), v = load_moment(second.lane);
-    const Vec moved = adam.step(load(value.lane), m, v, load(gradient.lane), load(rates.lane));
-    store(value.lane, moved);
-    store_moment(first.lane, m);
-    store_moment(second.lane, v);
-    for (const Part& part : parts) {
-      value.give(part.array.value, source, part.columns, part.at);
-      first.give(part.array.first, source, part.columns, part.at);
-      second.give(part.array.second, source, part.columns, part.at);
+    for (int part = 0; part < 4; ++part) {
+      const Vec gradient = column_of(quats, group.places, 4, part);
+      adam_column<Moment>(adam, update.quats, 4, part, group, gradient, update.rate_quats);
     }
-    if (geometry) {
-      Packed<float> grown;
-      store(grown.lane, exponential(moved));
-      grown.give(update.scales, source, 3, kScale);
-    }
-    if (opacity) {
-      Packed<float> seen;
-      store(seen.lane, sigmoid(moved));
-      seen.give(update.opacities, source, 1, kOpacity);
+    for (int axis = 0; axis < 3; ++axis) {
+      const Vec scale = column_of(update.scales, group.rows, 3, axis);
+      const Vec gradient = column_of(scales, group.places, 3, axis) * scale;
+      const Vec moved = adam_column<Moment>(adam, update.log_scales, 3, axis, group, gradient, update.rate_log_scales);
+      store(active.lane, exponential(moved));
+      active.give(update.scales + axis, group.rows, group.lanes, 3);
     }
   }
 }
@@ -104,7 +107,7 @@ RF_INLINE void each_float(const float* from, size_t count, float* to, Function f
   size_t at = 0;
   for (; at + kLanes <= count; at += kLanes) store(to + at, function(load(from + at)));
   if (at == count) return;
-  Packed<float> rest;
+  Column<float> rest = {};
   std::memcpy(rest.lane, from + at, (count - at) * sizeof(float));
   store(rest.lane, function(load(rest.lane)));
   std::memcpy(to + at, rest.lane, (count - at) * sizeof(float));

@@ -185,3 +185,11 @@ def test_the_shipped_field_is_scored_on_validation_positions(tmp_path, capsys) -
     assert "2nd solve" not in table_of_scores, "the validation positions were solved once"
     assert set(json.loads((tmp_path / "scores.json").read_text())) == {"validation"}
     assert "Hold-out: validation" in report.read_text()
+
+
+def test_a_preset_and_settings_of_the_radio_stage_do_not_mix(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ("--out", str(tmp_path / "field"))
+    assert main(["fit-radio", "nowhere.ply", "lobby", *out, "--preset", "fast", "--radio.steps", "3"]) == 2
+    assert "--preset fast sets all of the radio stage; give it or --radio.*, not both" in capsys.readouterr().err

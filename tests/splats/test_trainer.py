@@ -11,6 +11,7 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, equirect_grid, pinhole_grid, view_of
 from rf3dgs.splats.compositing import Compositing
 from rf3dgs.splats.density import Change
+from rf3dgs.splats.draw import draw
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.image_loss import l1_ssim
 from rf3dgs.splats.rates import Rates
@@ -352,3 +353,16 @@ def test_wrong_wishes_are_named():
         Target(torch.zeros(4, 4, 1), torch.zeros(4, 4))
     with pytest.raises(InputError, match="other names"):
         trainer.restore({"numbers": torch.zeros(4)})
+
+
+@pytest.mark.parametrize(("channels", "degree"), [(1, 3), (3, 3), (4, 1), (3, 0), (2, 2)])
+def test_drawing_alone_is_what_a_trainer_draws(channels: int, degree: int):
+    start, view = cloud(channels=channels, degree=degree), cameras()[0]
+    extra, background = torch.rand(80, 1, generator=torch.Generator().manual_seed(8)), torch.full((channels + 2,), 0.3)
+    options = {"extra": extra, "depth": True, "background": background}
+    found = draw(Gaussians(**start), view, **options)
+    kept = Trainer(**start, train=()).draw(view, **options)
+    exact = draw(Gaussians(**start), view, backend="reference", **options)
+    assert (found.values - kept.values).abs().max() < 1e-5
+    assert torch.equal(found.radii, kept.radii)
+    assert_same_picture(found.values, exact.values)

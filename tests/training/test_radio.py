@@ -256,3 +256,19 @@ def test_merged_geometry_renders_what_the_whole_one_does():
     errors = [level_error(field, held_out) for field in (whole, merged)]
     assert errors[1] < 1.1 * errors[0]
     assert torch.equal(merged.sees_transmitter(held_out.pose), whole.sees_transmitter(held_out.pose))
+
+
+def test_presets_have_names_and_keep_the_seed():
+    assert RadioConfig.preset("paper", seed=4) == RadioConfig.paper(seed=4)
+    assert RadioConfig.preset("fast", steps=7).steps == 7
+    assert RadioConfig.fast().steps < RadioConfig().steps < RadioConfig.best().steps
+    with pytest.raises(InputError, match="presets of the radio stage are fast, paper, best; got 'quick'"):
+        RadioConfig.preset("quick")
+
+
+def test_the_core_and_its_specification_train_the_same_field(training):
+    config = replace(QUICK, steps=24)
+    fields = [fit_radio(room(), training, replace(config, backend=backend)) for backend in ("native", "reference")]
+    for name in ("gain_sh", "csi_sh", "logit_opacities"):
+        found, expected = (getattr(field.surface, name) for field in fields)
+        assert (found - expected).norm() < 0.02 * expected.norm(), name

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from rf3dgs.cli.fit import checkpoints, drop_checkpoints
+from rf3dgs.cli.fit import Preset, checkpoints, chosen_radio, drop_checkpoints
 from rf3dgs.cli.show import console, out
 from rf3dgs.propagation.config import PhotoConfig, TraceConfig
 from rf3dgs.training.config import RadioConfig, VisualConfig
@@ -45,6 +45,8 @@ class Demo:
         default_factory=lambda: VisualConfig(steps=3000, max_count=40_000, ssim_weight=0.05, degree=1)
     )
     """The visual stage."""
+    preset: Preset | None = None
+    """All settings of the radio stage at once, in place of --radio.* (the seed stays)."""
     radio: RadioConfig = field(default_factory=RadioConfig)
     """The radio stage."""
 
@@ -62,6 +64,7 @@ class Demo:
         from rf3dgs.training.radio import fit_radio
         from rf3dgs.training.visual import fit_geometry
 
+        radio = chosen_radio(self.preset, self.radio)
         fresh = self.trace or self.scene != "lobby"
         from_mesh = self.geometry == "mesh" or (self.geometry == "auto" and self.scene != "lobby")
         clock = Clock()
@@ -99,7 +102,7 @@ class Demo:
         train = dataset.train.spectra
         assert train is not None
         with clock.stage("radio stage"):
-            config = replace(self.radio, seed=self.radio.seed + self.seed)
+            config = replace(radio, seed=radio.seed + self.seed)
             trained = fit_radio(geometry, train, config, progress=progress, checkpoint_dir=folder / "radio")
             trained.save(field_path)
         with clock.stage("evaluation"):

@@ -11,6 +11,8 @@ from rf3dgs.cli.show import console, note, out
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.training.config import RadioConfig, VisualConfig
 
+Preset = Literal["fast", "paper", "best"]
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -81,6 +83,8 @@ class FitRadio:
     """The field folder to write."""
     estimate_tx: bool = False
     """Estimate where the transmitter stands although the dataset knows it."""
+    preset: Preset | None = None
+    """All settings of the radio stage at once, in place of --radio.* (the seed stays)."""
     radio: RadioConfig = field(default_factory=RadioConfig)
     """The radio stage."""
 
@@ -89,8 +93,9 @@ class FitRadio:
         from rf3dgs.cli.facts import open_dataset
         from rf3dgs.splats.ply import read_ply
 
+        radio = chosen_radio(self.preset, self.radio)
         geometry, dataset = read_ply(self.geometry), open_dataset(self.dataset)
-        fit_field(geometry, dataset, self.out, self.radio, self.estimate_tx, source=str(self.geometry))
+        fit_field(geometry, dataset, self.out, radio, self.estimate_tx, source=str(self.geometry))
         return 0
 
 
@@ -110,6 +115,8 @@ class Fit:
     """Estimate where the transmitter stands although the dataset knows it."""
     visual: VisualConfig = field(default_factory=VisualConfig)
     """The visual stage."""
+    preset: Preset | None = None
+    """All settings of the radio stage at once, in place of --radio.* (the seed stays)."""
     radio: RadioConfig = field(default_factory=RadioConfig)
     """The radio stage."""
 
@@ -118,6 +125,7 @@ class Fit:
         from rf3dgs.cli.facts import open_dataset
         from rf3dgs.training.visual import fit_geometry
 
+        radio = chosen_radio(self.preset, self.radio)
         dataset = open_dataset(self.dataset)
         check_output(self.out)
         training_spectra(dataset)
@@ -129,8 +137,17 @@ class Fit:
             folder = checkpoints(self.out) / "visual"
             geometry = fit_geometry(dataset.train.photos, self.visual, progress=console(), checkpoint_dir=folder)
         source = self.mesh or str(dataset.path)
-        fit_field(geometry, dataset, self.out, self.radio, self.estimate_tx, source=source)
+        fit_field(geometry, dataset, self.out, radio, self.estimate_tx, source=source)
         return 0
+
+
+def chosen_radio(preset: Preset | None, radio: RadioConfig) -> RadioConfig:
+    """The preset with the seed of `radio`, or `radio` itself; raises InputError where both say something."""
+    if preset is None:
+        return radio
+    if radio != RadioConfig(seed=radio.seed):
+        raise InputError(f"--preset {preset} sets all of the radio stage; give it or --radio.*, not both")
+    return RadioConfig.preset(preset, seed=radio.seed)
 
 
 def fit_field(

@@ -12,7 +12,7 @@ from rf3dgs.core.grids import View
 from rf3dgs.splats.compositing import Compositing
 from rf3dgs.splats.harmonics import degree_of
 from rf3dgs.splats.raster import Raster
-from rf3dgs.splats.rasterize import Backend, pick_backend
+from rf3dgs.splats.rasterize import Backend, check_view, pick_backend
 from rf3dgs.splats.rates import Rates
 from rf3dgs.splats.target import Target
 
@@ -21,6 +21,7 @@ GROUPS = {
     "opacity": ("logit_opacities",),
     "sh": ("sh",),
 }
+BLEND_ONLY = Compositing()
 PARAMETERS = tuple(name for names in GROUPS.values() for name in names)
 
 
@@ -60,6 +61,34 @@ class Look:
     background: Tensor | None
     compositing: Compositing
     added: Tensor | None
+
+
+def make_look(
+    view: View,
+    shape: tuple[int, int, int],
+    extra: Tensor | None,
+    depth: bool,
+    background: Tensor | None,
+    compositing: Compositing,
+    added: Tensor | None,
+    like: Tensor,
+) -> Look:
+    """The `Look` of harmonics of a `shape` (gaussian, bases, channel) and of the dtype and device of `like`.
+
+    Raises InputError for what does not fit.
+    """
+    count, bases, channels = shape
+    if extra is not None and (extra.dim() != 2 or len(extra) != count):
+        raise InputError(f"extra must be [{count}, channel]; got {list(extra.shape)}")
+    width = channels + (0 if extra is None else extra.shape[1]) + depth
+    if background is not None and background.shape != (width,):
+        raise InputError(f"background must be [channel] = [{width}]; got {list(background.shape)}")
+    check_view(view, like.new_empty(0, width), background, None, compositing, added)
+    for name, tensor in (("extra", extra), ("background", background)):
+        if tensor is not None and (tensor.dtype, tensor.device) != (like.dtype, like.device):
+            raise InputError(f"{name} must be {like.dtype} on {like.device}; got {tensor.dtype} on {tensor.device}")
+    plain = [None if tensor is None else tensor.detach().contiguous() for tensor in (extra, background, added)]
+    return Look(view, bases, width, plain[0], depth, plain[1], compositing, plain[2])
 
 
 class Engine(Protocol):

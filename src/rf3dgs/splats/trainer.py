@@ -17,15 +17,14 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import Panorama, View
 from rf3dgs.splats.compositing import Compositing
 from rf3dgs.splats.density import Change, DensityState
-from rf3dgs.splats.engine import Engine, Look, Scheme, check_tensors, make_engine
+from rf3dgs.splats.engine import BLEND_ONLY, Engine, Look, Scheme, check_tensors, make_engine, make_look
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import coefficient_count, degree_of
 from rf3dgs.splats.raster import Raster
-from rf3dgs.splats.rasterize import Backend, check_view
+from rf3dgs.splats.rasterize import Backend
 from rf3dgs.splats.rates import Rates
 from rf3dgs.splats.target import Target
 
-BLEND_ONLY = Compositing()
 FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 
@@ -237,15 +236,10 @@ class Trainer:
         compositing: Compositing,
         added: Tensor | None,
     ) -> Look:
-        if extra is not None and (extra.dim() != 2 or len(extra) != len(self)):
-            raise InputError(f"extra must be [{len(self)}, channel]; got {list(extra.shape)}")
-        width = self._sizes[1] + (0 if extra is None else extra.shape[1]) + depth
-        if background is not None and background.shape != (width,):
-            raise InputError(f"background must be [channel] = [{width}]; got {list(background.shape)}")
-        check_view(view, self._like.new_empty(0, width), background, None, compositing, added)
-        plain = (None if tensor is None else tensor.detach().contiguous() for tensor in (extra, background, added))
-        extra, background, added = plain
-        return Look(view, coefficient_count(self.degree), width, extra, depth, background, compositing, added)
+        bases = coefficient_count(self.degree)
+        return make_look(
+            view, (len(self), bases, self.channels), extra, depth, background, compositing, added, self._like
+        )
 
     def _check_trains(self, look: Look) -> None:
         if not self._scheme.train:

@@ -1,7 +1,9 @@
 """What a person may choose about training: frozen dataclasses without torch, which the command line shows as is."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
+
+from rf3dgs.core.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -62,19 +64,43 @@ class RadioConfig:
     """Iterations between checkpoints when a checkpoint folder is given."""
 
     @classmethod
+    def preset(cls, name: str, *, steps: int | None = None, seed: int = 0) -> "RadioConfig":
+        """The settings of that name in `PRESETS`, with their own number of steps unless another is given."""
+        if name not in PRESETS:
+            raise InputError(f"the presets of the radio stage are {', '.join(PRESETS)}; got {name!r}")
+        chosen = replace(PRESETS[name], seed=seed)
+        return chosen if steps is None else replace(chosen, steps=steps)
+
+    @classmethod
+    def fast(cls, seed: int = 0) -> "RadioConfig":
+        """Closed form and a short polish."""
+        return cls.preset("fast", seed=seed)
+
+    @classmethod
+    def best(cls, seed: int = 0) -> "RadioConfig":
+        """As far as the model goes."""
+        return cls.preset("best", seed=seed)
+
+    @classmethod
     def paper(cls, steps: int = 10_000, seed: int = 0) -> "RadioConfig":
         """The published recipe: its encoding, harmonics from grey, the line of sight on the surface, larger rates."""
-        return cls(
-            steps=steps,
-            seed=seed,
-            encoding="paper",
-            line_of_sight="surface",
-            start="grey",
-            lr_level=5.6e-3,
-            lr_harmonics=1.4e-3,
-            lr_opacity=5e-2,
-            lr_csi=5.6e-3,
-        )
+        return cls.preset("paper", steps=steps, seed=seed)
+
+
+PRESETS = {
+    "fast": RadioConfig(steps=300),
+    "paper": RadioConfig(
+        steps=10_000,
+        encoding="paper",
+        line_of_sight="surface",
+        start="grey",
+        lr_level=5.6e-3,
+        lr_harmonics=1.4e-3,
+        lr_opacity=5e-2,
+        lr_csi=5.6e-3,
+    ),
+    "best": RadioConfig(steps=5_000),
+}
 
 
 @dataclass(frozen=True)

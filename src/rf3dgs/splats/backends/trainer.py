@@ -105,7 +105,7 @@ class NativeEngine:
         view = look.view
         picture, weight = torch.empty(view.height, view.width, look.width), torch.empty(view.height, view.width)
         radii = torch.empty(self.count)
-        self.trainer.draw(*_arguments(look), picture, weight, radii, thread_count())
+        self.trainer.draw(*look_arguments(look), picture, weight, radii, thread_count())
         return Raster(picture, weight, radii)
 
     def update(
@@ -121,7 +121,7 @@ class NativeEngine:
         """All of a step in one call."""
         statistics = target.statistics if ssim_weight > 0 else None
         return self.trainer.step(
-            *_arguments(look),
+            *look_arguments(look),
             *(target.picture, target.weight, statistics, ssim_weight),
             *self._rates(rates, shrink),
             steps,
@@ -140,7 +140,7 @@ class NativeEngine:
         return other
 
 
-def _arguments(look: Look) -> tuple[Any, ...]:
+def look_arguments(look: Look) -> tuple[Any, ...]:
     """What the core has to know to draw."""
     return (*view_arguments(look.view), look.bases, look.extra, look.depth, look.background, *_finishing(look))
 
