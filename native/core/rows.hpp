@@ -33,14 +33,14 @@ RF_INLINE void store_part(float* to, __m128 value) {
 
 #if defined(__AVX512F__)
 
-template <int Count>
-RF_INLINE void load_columns_part(const float* const* rows, int offset, Vec* out) {
+template <int Count, class Row>
+RF_INLINE void load_columns_part(const Row& row, int offset, Vec* out) {
   __m512 z[4];
   for (int i = 0; i < 4; ++i) {
-    z[i] = _mm512_castps128_ps512(load_part<Count>(rows[i] + offset));
-    z[i] = _mm512_insertf32x4(z[i], load_part<Count>(rows[4 + i] + offset), 1);
-    z[i] = _mm512_insertf32x4(z[i], load_part<Count>(rows[8 + i] + offset), 2);
-    z[i] = _mm512_insertf32x4(z[i], load_part<Count>(rows[12 + i] + offset), 3);
+    z[i] = _mm512_castps128_ps512(load_part<Count>(row(i) + offset));
+    z[i] = _mm512_insertf32x4(z[i], load_part<Count>(row(4 + i) + offset), 1);
+    z[i] = _mm512_insertf32x4(z[i], load_part<Count>(row(8 + i) + offset), 2);
+    z[i] = _mm512_insertf32x4(z[i], load_part<Count>(row(12 + i) + offset), 3);
   }
   RF_TRANSPOSE(512, z[0], z[1], z[2], z[3]);
   for (int column = 0; column < Count; ++column) out[column] = (Vec)z[column];
@@ -61,13 +61,13 @@ RF_INLINE void store_columns_part(const Vec* columns, float* const* rows, int la
 
 #elif defined(__AVX2__)
 
-template <int Count>
-RF_INLINE void load_columns_part(const float* const* rows, int offset, Vec* out) {
-  for (int half = 0; half < 2; ++half, rows += 8) {
+template <int Count, class Row>
+RF_INLINE void load_columns_part(const Row& row, int offset, Vec* out) {
+  for (int half = 0; half < 2; ++half) {
     __m256 y[4];
     for (int i = 0; i < 4; ++i) {
-      y[i] = _mm256_insertf128_ps(_mm256_castps128_ps256(load_part<Count>(rows[i] + offset)),
-                                  load_part<Count>(rows[4 + i] + offset), 1);
+      y[i] = _mm256_insertf128_ps(_mm256_castps128_ps256(load_part<Count>(row(8 * half + i) + offset)),
+                                  load_part<Count>(row(8 * half + 4 + i) + offset), 1);
     }
     RF_TRANSPOSE(256, y[0], y[1], y[2], y[3]);
     for (int column = 0; column < Count; ++column) out[column].part[half] = (FloatPart)y[column];
@@ -89,11 +89,11 @@ RF_INLINE void store_columns_part(const Vec* columns, float* const* rows, int la
 
 #else
 
-template <int Count>
-RF_INLINE void load_columns_part(const float* const* rows, int offset, Vec* out) {
+template <int Count, class Row>
+RF_INLINE void load_columns_part(const Row& row, int offset, Vec* out) {
   for (int column = 0; column < Count; ++column) {
     alignas(64) float lanes[kLanes];
-    for (int lane = 0; lane < kLanes; ++lane) lanes[lane] = rows[lane][offset + column];
+    for (int lane = 0; lane < kLanes; ++lane) lanes[lane] = row(lane)[offset + column];
     out[column] = load(lanes);
   }
 }
@@ -109,13 +109,14 @@ RF_INLINE void store_columns_part(const Vec* columns, float* const* rows, int la
 
 #endif
 
-// The columns of sixteen rows of N floats, and back; only the first `lanes` rows are written.
-template <int N>
-RF_INLINE void load_columns(const float* const* rows, Vec* out) {
-  for (int at = 0; at + 4 <= N; at += 4) load_columns_part<4>(rows, at, out + at);
-  if constexpr (N % 4 != 0) load_columns_part<N % 4>(rows, N / 4 * 4, out + N / 4 * 4);
+// The columns of sixteen rows of N floats, and back; row(lane) says where a row is.
+template <int N, class Row>
+RF_INLINE void load_columns(const Row& row, Vec* out) {
+  for (int at = 0; at + 4 <= N; at += 4) load_columns_part<4>(row, at, out + at);
+  if constexpr (N % 4 != 0) load_columns_part<N % 4>(row, N / 4 * 4, out + N / 4 * 4);
 }
 
+// Only the first `lanes` rows are written.
 template <int N>
 RF_INLINE void store_columns(const Vec* columns, float* const* rows, int lanes) {
   for (int at = 0; at + 4 <= N; at += 4) store_columns_part<4>(columns + at, rows, lanes, at);
@@ -125,17 +126,18 @@ RF_INLINE void store_columns(const Vec* columns, float* const* rows, int lanes) 
 // Sixteen rows of N floats that start at `from`; rows from `lanes` on repeat the last.
 template <int N>
 RF_INLINE void load_columns_from(const float* from, int lanes, Vec* out) {
-  const float* rows[kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) rows[lane] = from + N * (lane < lanes ? lane : lanes - 1);
-  load_columns<N>(rows, out);
+  if (lanes == kLanes) {
+    load_columns<N>([from](int lane) { return from + N * lane; }, out);
+  } else {
+    load_columns<N>([from, lanes](int lane) { return from + N * (lane < lanes ? lane : lanes - 1); }, out);
+  }
 }
 
 // The same rows of N floats of an array, by their indices.
 template <int N>
-RF_INLINE void load_columns_at(const float* from, const size_t* index, Vec* out) {
-  const float* rows[kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) rows[lane] = from + N * index[lane];
-  load_columns<N>(rows, out);
+RF_INLINE void load_columns_at(const float* from, const uint32_t* index, int lanes, Vec* out) {
+  load_columns<N>(
+      [=](int lane) { return from + N * static_cast<size_t>(index[lane < lanes ? lane : lanes - 1]); }, out);
 }
 
 template <int N>

@@ -187,6 +187,22 @@ RF_INLINE Vec max_vec(Vec a, Vec b) {
 RF_INLINE Vec min_vec(Vec a, Vec b) { return select(a < b, a, b); }
 RF_INLINE Vec max_vec(Vec a, Vec b) { return select(a > b, a, b); }
 #endif
+// The first `lanes` floats; the others repeat the last of them.
+RF_INLINE Vec load_some(const float* from, int lanes) {
+  if (lanes == kLanes) return load(from);
+  alignas(64) float of[kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) of[lane] = from[lane < lanes ? lane : lanes - 1];
+  return load(of);
+}
+
+// Of floats that are not negative, whose bits order as they do; the units that compare integers are less in demand.
+RF_INLINE Vec min_of_positive(const Vec& a, const Vec& b) {
+#if defined(__AVX512F__)
+  return (Vec)_mm512_min_epi32((__m512i)a, (__m512i)b);
+#else
+  return min_vec(a, b);
+#endif
+}
 RF_INLINE Vec clamp_vec(Vec value, Vec low, Vec high) { return min_vec(max_vec(value, low), high); }
 
 RF_INLINE Vec sqrt_vec(Vec value) {

@@ -59,7 +59,7 @@ RF_INLINE Step<Shape> advance(const typename Shape::Splat& splat, const typename
   Step<Shape> step;
   const Vec exponent = Shape::log2_alpha(splat, pixels, step.point);
   const Mask seen = at_least(exponent, splat_vec(kLog2AlphaMin));
-  step.alpha = keep(seen, min_vec(exp2_vec(exponent), splat_vec(kAlphaMax)));
+  step.alpha = keep(seen, min_of_positive(exp2_vec(exponent), splat_vec(kAlphaMax)));
   const Vec weight = step.alpha * light.product, after = light.product - weight;
   step.counts = at_least(after, splat_vec(kTransmittanceStop));
   if constexpr (kGate) step.counts = both(step.counts, at_least(light.limit, splat_vec(splat.depth)));

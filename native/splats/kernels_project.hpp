@@ -36,11 +36,24 @@ struct Projection {
   IntVec fine;           // a Gaussian that can be drawn
 };
 
-RF_INLINE Vec gather(const float* from, const size_t* index, int stride, int column) {
-  alignas(64) float lanes[kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) lanes[lane] = from[index[lane] * stride + column];
-  return load(lanes);
-}
+// Sixteen Gaussians side by side, or those whose indices are given.
+struct Neighbours {
+  size_t start;
+  int lanes;
+  template <int N>
+  RF_INLINE void columns(const float* from, Vec* out) const {
+    load_columns_from<N>(from + N * start, lanes, out);
+  }
+};
+
+struct Chosen {
+  const uint32_t* sources;
+  int lanes;
+  template <int N>
+  RF_INLINE void columns(const float* from, Vec* out) const {
+    load_columns_at<N>(from, sources, lanes, out);
+  }
+};
 
 constexpr float kHalfLog2E = 0.5f * 1.442695040888963f;
 
@@ -58,10 +71,11 @@ RF_INLINE Vec log2_above_cut(Vec opacity) {
 RF_INLINE IntVec is_finite(Vec value) { return (int_bits(value) & 0x7f800000) != 0x7f800000; }
 
 // Where the centres are, in the camera and on the screen.
-RF_INLINE void project_centres(const View& view, const Geometry& in, const size_t* index, Projection& p) {
+template <class Which>
+RF_INLINE void project_centres(const View& view, const Geometry& in, const Which& which, Projection& p) {
   const float* w = view.rotation;
   Vec mean[3];
-  load_columns_at<3>(in.means, index, mean);
+  which.template columns<3>(in.means, mean);
   p.x = w[0] * mean[0] + w[1] * mean[1] + w[2] * mean[2] + view.translation[0];
   p.y = w[3] * mean[0] + w[4] * mean[1] + w[5] * mean[2] + view.translation[1];
   p.z = w[6] * mean[0] + w[7] * mean[1] + w[8] * mean[2] + view.translation[2];
@@ -74,7 +88,7 @@ RF_INLINE void project_centres(const View& view, const Geometry& in, const size_
   p.v = clamp_vec(v, splat_vec(view.v_low), splat_vec(view.v_high));
   p.screen_x = view.fx * u + view.cx;
   p.screen_y = view.fy * v + view.cy;
-  load_columns_at<3>(in.scales, index, p.s);
+  which.template columns<3>(in.scales, p.s);
 }
 
 // Whether any of the Gaussians may touch the picture: the rows of J have the lengths fx sqrt(1 + u^2) / z and
@@ -91,10 +105,11 @@ RF_INLINE bool may_be_seen(const View& view, const Vec& opacity, const Projectio
 }
 
 // The rest of the projection, after the centres.
-RF_INLINE void project_shapes(const View& view, const Geometry& in, const size_t* index, Projection& p) {
+template <class Which>
+RF_INLINE void project_shapes(const View& view, const Geometry& in, const Which& which, Projection& p) {
   const float* w = view.rotation;
   Vec quat[4];
-  load_columns_at<4>(in.quats, index, quat);
+  which.template columns<4>(in.quats, quat);
   const Vec qw = quat[0], qx = quat[1], qy = quat[2], qz = quat[3];
   const Vec norm = sqrt_vec(qw * qw + qx * qx + qy * qy + qz * qz);
   p.fine &= (norm > kMinQuaternionNorm) & is_finite(norm);
@@ -140,20 +155,19 @@ size_t project(const View& view, const Geometry& in, size_t begin, size_t end, c
   size_t visible = 0;
   std::memset(out.radii + begin, 0, (end - begin) * sizeof(float));
   for (size_t start = begin; start < end; start += kLanes) {
-    size_t index[kLanes];
     const int lanes = static_cast<int>(end - start < kLanes ? end - start : kLanes);
-    for (int lane = 0; lane < kLanes; ++lane) index[lane] = start + (lane < lanes ? lane : lanes - 1);
+    const Neighbours which = {start, lanes};
     Projection p;
-    project_centres(view, in, index, p);
-    const Vec opacity = gather(in.opacities, index, 1, 0);
+    project_centres(view, in, which, p);
+    const Vec opacity = load_some(in.opacities + start, lanes);
     if (in.offset != nullptr) {
       Vec offset[2];
-      load_columns_at<2>(in.offset, index, offset);
+      which.template columns<2>(in.offset, offset);
       p.screen_x += offset[0];
       p.screen_y += offset[1];
     }
     if (!may_be_seen(view, opacity, p)) continue;
-    project_shapes(view, in, index, p);
+    project_shapes(view, in, which, p);
     IntVec fine = p.fine & (opacity >= kAlphaMin) & is_finite(opacity);
     fine &= is_finite(p.screen_x) & is_finite(p.screen_y);
     const Vec middle = 0.5f * (p.sxx + p.syy), half = 0.5f * (p.sxx - p.syy);
@@ -192,18 +206,14 @@ void project_backward(const View& view, const Geometry& in, const uint32_t* sour
   const float* w = view.rotation;
   for (size_t start = 0; start < count; start += kLanes) {
     const int lanes = static_cast<int>(count - start < kLanes ? count - start : kLanes);
-    size_t index[kLanes], row[kLanes];
-    for (int lane = 0; lane < kLanes; ++lane) {
-      row[lane] = start + (lane < lanes ? lane : lanes - 1);
-      index[lane] = sources[row[lane]];
-    }
+    const Chosen which = {sources + start, lanes};
     Projection p;
-    project_centres(view, in, index, p);
-    project_shapes(view, in, index, p);
+    project_centres(view, in, which, p);
+    project_shapes(view, in, which, p);
     const Vec qa = p.syy * p.inverse_determinant, qb = -p.sxy * p.inverse_determinant;
     const Vec qc = p.sxx * p.inverse_determinant;
     Vec sum[5];
-    load_columns_at<5>(sums, row, sum);
+    load_columns_from<5>(sums + 5 * start, lanes, sum);
     const Vec gx = qa * sum[0] + qb * sum[1], gy = qb * sum[0] + qc * sum[1];
     const Vec ga = -0.5f * sum[2], gb = -0.5f * sum[3], gc = -0.5f * sum[4];
 
