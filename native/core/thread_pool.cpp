@@ -2,6 +2,7 @@
 
 #include <unistd.h>
 
+#include <algorithm>
 #include <atomic>
 #include <condition_variable>
 #include <exception>
@@ -12,7 +13,13 @@
 namespace rf3dgs {
 namespace {
 
-constexpr int kSpins = 2000;
+constexpr int kSpins = 500;  // some ten microseconds
+
+inline void relax() {
+#if defined(__x86_64__)
+  __builtin_ia32_pause();
+#endif
+}
 
 class Pool {
  public:
@@ -29,13 +36,14 @@ class Pool {
     helpers_ = helpers;
     failure_ = nullptr;
     next_.store(0, std::memory_order_relaxed);
-    busy_.store(static_cast<int>(workers_.size()), std::memory_order_relaxed);
+    open_.store(true);
     {
       std::lock_guard<std::mutex> lock(sleep_mutex_);
       generation_.fetch_add(1, std::memory_order_release);
     }
     wake_.notify_all();
     take_turns();
+    open_.store(false);
     wait_for_helpers();
     if (failure_) std::rethrow_exception(failure_);
   }
@@ -51,17 +59,20 @@ class Pool {
     }
   }
 
+  // A worker counts itself in before it looks whether a loop is open, and the loop is closed before its caller waits for
+  // nobody to be inside: so a worker touches a loop only while its caller waits, and a worker that wakes late is not
+  // waited for.
   void wait_for_loops(int rank, unsigned seen) {
     for (;;) {
-      int spins = 0;
-      while (generation_.load(std::memory_order_acquire) == seen && spins < kSpins) ++spins;
+      for (int spins = 0; generation_.load(std::memory_order_acquire) == seen && spins < kSpins; ++spins) relax();
       if (generation_.load(std::memory_order_acquire) == seen) {
         std::unique_lock<std::mutex> lock(sleep_mutex_);
         wake_.wait(lock, [&] { return generation_.load(std::memory_order_relaxed) != seen; });
       }
       seen = generation_.load(std::memory_order_acquire);
-      if (rank < helpers_) take_turns();
-      if (busy_.fetch_sub(1, std::memory_order_acq_rel) == 1) {
+      inside_.fetch_add(1);
+      if (open_.load() && rank < helpers_) take_turns();
+      if (inside_.fetch_sub(1) == 1 && !open_.load()) {
         std::lock_guard<std::mutex> lock(sleep_mutex_);
         done_.notify_one();
       }
@@ -70,10 +81,11 @@ class Pool {
 
   void wait_for_helpers() {
     for (int spins = 0; spins < kSpins; ++spins) {
-      if (busy_.load(std::memory_order_acquire) == 0) return;
+      if (inside_.load() == 0) return;
+      relax();
     }
     std::unique_lock<std::mutex> lock(sleep_mutex_);
-    done_.wait(lock, [&] { return busy_.load(std::memory_order_acquire) == 0; });
+    done_.wait(lock, [&] { return inside_.load() == 0; });
   }
 
   std::mutex loop_mutex_;
@@ -82,8 +94,9 @@ class Pool {
   std::condition_variable done_;
   std::vector<std::thread> workers_;
   std::atomic<unsigned> generation_{0};
+  std::atomic<bool> open_{false};
+  std::atomic<int> inside_{0};  // workers
   std::atomic<int> next_{0};
-  std::atomic<int> busy_{0};
   const Work* work_ = nullptr;
   int count_ = 0;
   int helpers_ = 0;
