@@ -28,23 +28,24 @@ auto* data_or_null(const std::optional<Array>& array) {
   return array ? array->data() : nullptr;
 }
 
-// A pinhole camera.
-inline View view_of(const In<4, 4>& viewmat, const In<3, 3>& camera, int width, int height) {
+// A pinhole camera, or without a camera matrix the whole sphere.
+inline View view_of(const In<4, 4>& viewmat, const std::optional<In<3, 3>>& camera, int width, int height) {
   require(width > 0 && height > 0, "a picture needs at least one pixel each way");
   View view{};
-  view.kind = Kind::pinhole;
+  view.kind = camera ? Kind::pinhole : Kind::sphere;
+  view.width = width;
+  view.height = height;
   const float* m = viewmat.data();
-  const float* k = camera.data();
   for (int row = 0; row < 3; ++row) {
     for (int col = 0; col < 3; ++col) view.rotation[3 * row + col] = m[4 * row + col];
     view.translation[row] = m[4 * row + 3];
   }
+  if (!camera) return view;
+  const float* k = camera->data();
   view.fx = k[0];
   view.fy = k[4];
   view.cx = k[2];
   view.cy = k[5];
-  view.width = width;
-  view.height = height;
   view.u_low = -kFieldClamp * view.cx / view.fx;
   view.u_high = kFieldClamp * (width - view.cx) / view.fx;
   view.v_low = -kFieldClamp * view.cy / view.fy;

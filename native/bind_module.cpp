@@ -32,7 +32,7 @@ Geometry geometry_of(const In<-1, 3>& means, const In<-1, 4>& quats, const In<-1
 }
 
 std::unique_ptr<Scene> forward(In<-1, 3> means, In<-1, 4> quats, In<-1, 3> scales, In<-1> opacities, In<-1, -1> values,
-                               In<4, 4> viewmat, In<3, 3> camera, std::optional<In<-1>> background,
+                               In<4, 4> viewmat, std::optional<In<3, 3>> camera, std::optional<In<-1>> background,
                                std::optional<In<-1, 2>> offset, std::optional<float> gate, Out<-1, -1, -1> picture,
                                Out<-1, -1> weight, Out<-1> radii, std::optional<Out<-1>> max_weight, int threads) {
   const Geometry geometry = geometry_of(means, quats, scales, opacities, offset);
@@ -69,7 +69,8 @@ void backward(Scene& scene, In<-1, 3> means, In<-1, 4> quats, In<-1, 3> scales, 
               In<-1, -1, -1> picture_gradient, std::optional<In<-1, -1>> weight_gradient,
               std::optional<Out<-1, -1>> values_gradient, std::optional<Out<-1>> opacities_gradient,
               std::optional<Out<-1, 3>> means_gradient, std::optional<Out<-1, 4>> quats_gradient,
-              std::optional<Out<-1, 3>> scales_gradient, std::optional<Out<-1, 2>> offset_gradient, int threads) {
+              std::optional<Out<-1, 3>> scales_gradient, std::optional<Out<-1, 2>> offset_gradient,
+              std::optional<Out<-1, 9>> sphere_gradient, int threads) {
   const Geometry geometry = geometry_of(means, quats, scales, opacities, offset);
   const size_t height = scene.view.height, width = scene.view.width, channels = scene.channels;
   const auto is_picture = [&](const In<-1, -1, -1>& array) {
@@ -80,7 +81,8 @@ void backward(Scene& scene, In<-1, 3> means, In<-1, 4> quats, In<-1, 3> scales, 
   require(means.shape(0) == scene.gaussians && is_picture(picture) && is_picture(picture_gradient) &&
               is_map(weight) && (!weight_gradient || is_map(*weight_gradient)) && fits(values_gradient) &&
               (!values_gradient || values_gradient->shape(1) == channels) && fits(opacities_gradient) &&
-              fits(means_gradient) && fits(quats_gradient) && fits(scales_gradient) && fits(offset_gradient),
+              fits(means_gradient) && fits(quats_gradient) && fits(scales_gradient) && fits(offset_gradient) &&
+              fits(sphere_gradient),
           "gradients do not fit the scene");
   float* const to_values = data_or_null(values_gradient);
   float* const to_opacities = data_or_null(opacities_gradient);
@@ -88,7 +90,10 @@ void backward(Scene& scene, In<-1, 3> means, In<-1, 4> quats, In<-1, 3> scales, 
   float* const to_quats = data_or_null(quats_gradient);
   float* const to_scales = data_or_null(scales_gradient);
   float* const to_offset = data_or_null(offset_gradient);
-  const bool any = to_means != nullptr || to_quats != nullptr || to_scales != nullptr || to_offset != nullptr;
+  float* const to_sphere = data_or_null(sphere_gradient);
+  const bool flat = to_means != nullptr || to_quats != nullptr || to_scales != nullptr || to_offset != nullptr;
+  require(!(scene.view.kind == Kind::sphere ? flat : to_sphere != nullptr), "these gradients belong to another view");
+  const bool any = flat || to_sphere != nullptr;
   const auto take = [=](size_t begin, size_t end, const uint32_t* sources, const float* values, const float* opacity,
                         const GeometryRows* rows) {
     const size_t count = end - begin;
@@ -100,6 +105,7 @@ void backward(Scene& scene, In<-1, 3> means, In<-1, 4> quats, In<-1, 3> scales, 
     if (to_quats != nullptr) scatter<4>(rows->quats, sources, count, to_quats);
     if (to_scales != nullptr) scatter<3>(rows->scales, sources, count, to_scales);
     if (to_offset != nullptr) scatter<2>(rows->offset, sources, count, to_offset);
+    if (to_sphere != nullptr) scatter<9>(rows->sphere, sources, count, to_sphere);
   };
   nb::gil_scoped_release released;
   rasterize_backward(scene, geometry, picture.data(), weight.data(), picture_gradient.data(),
@@ -161,6 +167,8 @@ NB_MODULE(_native, m) {
         result["BLUR"] = kBlur;
         result["NEAR"] = kNear;
         result["FIELD_CLAMP"] = kFieldClamp;
+        result["HALF_TRANSMITTANCE"] = kHalfTransmittance;
+        result["SPHERE_FIELD"] = kSphereField;
         result["SSIM_RADIUS"] = kSsimRadius;
         result["SSIM_SIGMA"] = kSsimSigma;
         result["SSIM_C1"] = kSsimC1;
@@ -176,7 +184,7 @@ NB_MODULE(_native, m) {
 
   m.def("rasterize", &forward, nb::arg("means").noconvert(), nb::arg("quats").noconvert(),
         nb::arg("scales").noconvert(), nb::arg("opacities").noconvert(), nb::arg("values").noconvert(),
-        nb::arg("viewmat").noconvert(), nb::arg("camera").noconvert(), nb::arg("background").noconvert().none(),
+        nb::arg("viewmat").noconvert(), nb::arg("camera").noconvert().none(), nb::arg("background").noconvert().none(),
         nb::arg("offset").noconvert().none(), nb::arg("gate").none(), nb::arg("picture").noconvert(),
         nb::arg("weight").noconvert(), nb::arg("radii").noconvert(), nb::arg("max_weight").noconvert().none(),
         nb::arg("threads"));
@@ -186,7 +194,7 @@ NB_MODULE(_native, m) {
         nb::arg("values_gradient").noconvert().none(), nb::arg("opacities_gradient").noconvert().none(),
         nb::arg("means_gradient").noconvert().none(), nb::arg("quats_gradient").noconvert().none(),
         nb::arg("scales_gradient").noconvert().none(), nb::arg("offset_gradient").noconvert().none(),
-        nb::arg("threads"));
+        nb::arg("sphere_gradient").noconvert().none(), nb::arg("threads"));
   m.def("harmonics_forward", &harmonics_forward, nb::arg("sh").noconvert(), nb::arg("directions").noconvert(),
         nb::arg("out").noconvert(), nb::arg("threads"));
   m.def("harmonics_backward", &harmonics_backward, nb::arg("gradient").noconvert(), nb::arg("directions").noconvert(),

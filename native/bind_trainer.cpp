@@ -56,8 +56,7 @@ std::shared_ptr<Wishes> wishes_of(const In<4, 4>& viewmat, const std::optional<I
                                   std::optional<In<-1, -1, -1>> added) {
   auto wishes = std::make_shared<Wishes>(Wishes{std::move(extra), std::move(background), std::move(added), {}, {}});
   Drawing& drawing = wishes->drawing;
-  require(camera.has_value(), "the core draws cameras only");
-  drawing.view = view_of(viewmat, *camera, width, height);
+  drawing.view = view_of(viewmat, camera, width, height);
   drawing.extra = data_or_null(wishes->extra);
   drawing.extras = wishes->extra ? static_cast<int>(wishes->extra->shape(1)) : 0;
   drawing.depth = depth;

@@ -15,8 +15,18 @@ enum class Kind { pinhole, sphere };
 constexpr int kKinds = 2;
 constexpr int kMostGeometrySums = 9;  // of any shape
 
+// Sines and cosines, 16 and 16, of the azimuths of columns on the sphere, counted from the left edge, and of the zenith
+// angles of rows: of a 4x4 block's pixels for each column and each row of blocks, and of the middles of a tile's blocks for
+// each column and each row of tiles.
+struct SphereGrid {
+  const float* block_column;
+  const float* block_row;
+  const float* tile_column;
+  const float* tile_row;
+};
+
 // camera_from_world (row-major rotation, translation) and the picture's size; for a pinhole also focal lengths and
-// centre in pixels and the limits of x/z and y/z in the Jacobian.
+// centre in pixels and the limits of x/z and y/z in the Jacobian; for the sphere its tables, which `rasterize` fills in.
 struct View {
   Kind kind;
   float rotation[9];
@@ -24,6 +34,7 @@ struct View {
   int width, height;
   float fx, fy, cx, cy;
   float u_low, u_high, v_low, v_high;
+  SphereGrid sphere;
 };
 
 // Activated Gaussians, as the caller keeps them.
@@ -64,7 +75,7 @@ struct Entry {
 };
 
 // Rows of gradients of visible splats: of the activated parameters for a pinhole; on the sphere of what the splat is
-// drawn with: f1, f2, m.
+// drawn with (see `project_sphere_backward`).
 struct GeometryRows {
   float* means;
   float* quats;

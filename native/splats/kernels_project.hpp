@@ -70,44 +70,22 @@ RF_INLINE Vec log2_above_cut(Vec opacity) {
 
 RF_INLINE IntVec is_finite(Vec value) { return (int_bits(value) & 0x7f800000) != 0x7f800000; }
 
-// Where the centres are, in the camera and on the screen.
+// Where Gaussians lie in the camera and how wide they are.
 template <class Which>
-RF_INLINE void project_centres(const View& view, const Geometry& in, const Which& which, Projection& p) {
+RF_INLINE void place_lanes(const View& view, const Geometry& in, const Which& which, Projection& p) {
   const float* w = view.rotation;
   Vec mean[3];
   which.template columns<3>(in.means, mean);
   p.x = w[0] * mean[0] + w[1] * mean[1] + w[2] * mean[2] + view.translation[0];
   p.y = w[3] * mean[0] + w[4] * mean[1] + w[5] * mean[2] + view.translation[1];
   p.z = w[6] * mean[0] + w[7] * mean[1] + w[8] * mean[2] + view.translation[2];
-  p.fine = (p.z > kNear) & is_finite(p.x) & is_finite(p.y) & is_finite(p.z);
-  p.inverse_z = 1.0f / p.z;
-  const Vec u = p.x * p.inverse_z, v = p.y * p.inverse_z;
-  p.u_free = (u >= view.u_low) & (u <= view.u_high);
-  p.v_free = (v >= view.v_low) & (v <= view.v_high);
-  p.u = clamp_vec(u, splat_vec(view.u_low), splat_vec(view.u_high));
-  p.v = clamp_vec(v, splat_vec(view.v_low), splat_vec(view.v_high));
-  p.screen_x = view.fx * u + view.cx;
-  p.screen_y = view.fy * v + view.cy;
+  p.fine = is_finite(p.x) & is_finite(p.y) & is_finite(p.z);
   which.template columns<3>(in.scales, p.s);
 }
 
-// Whether any of the Gaussians may touch the picture: the rows of J have the lengths fx sqrt(1 + u^2) / z and
-// fy sqrt(1 + v^2) / z, and no Gaussian is longer than its largest scale.
-RF_INLINE bool may_be_seen(const View& view, const Vec& opacity, const Projection& p) {
-  constexpr float kReach2 = 11.09f;  // no Gaussian reaches further than sqrt(2 ln 255) standard deviations
-  const Vec scale = max_vec(p.s[0], max_vec(p.s[1], p.s[2])) * p.inverse_z, scale2 = scale * scale * (1.01f * kReach2);
-  const Vec wide = sqrt_vec(scale2 * (view.fx * view.fx) * (1.0f + p.u * p.u) + kReach2 * kBlur) + 1.0f;
-  const Vec tall = sqrt_vec(scale2 * (view.fy * view.fy) * (1.0f + p.v * p.v) + kReach2 * kBlur) + 1.0f;
-  const Vec width = splat_vec(static_cast<float>(view.width)), height = splat_vec(static_cast<float>(view.height));
-  const IntVec beside = (p.screen_x + wide < 0.0f) | (p.screen_x - wide > width) | (p.screen_y + tall < 0.0f) |
-                        (p.screen_y - tall > height);
-  return (bits_of(p.fine & (opacity >= kAlphaMin)) & ~bits_of(beside)) != 0;
-}
-
-// The rest of the projection, after the centres.
+// How they are turned.
 template <class Which>
-RF_INLINE void project_shapes(const View& view, const Geometry& in, const Which& which, Projection& p) {
-  const float* w = view.rotation;
+RF_INLINE void turn_lanes(const Geometry& in, const Which& which, Projection& p) {
   Vec quat[4];
   which.template columns<4>(in.quats, quat);
   const Vec qw = quat[0], qx = quat[1], qy = quat[2], qz = quat[3];
@@ -128,6 +106,41 @@ RF_INLINE void project_shapes(const View& view, const Geometry& in, const Which&
   p.r[7] = 2.0f * (p.qy * p.qz + p.qw * p.qx);
   p.r[8] = 1.0f - 2.0f * (p.qx * p.qx + p.qy * p.qy);
   for (int axis = 0; axis < 3; ++axis) p.fine &= (p.s[axis] >= 0.0f);
+}
+
+// Where the centres are, in the camera and on the screen.
+template <class Which>
+RF_INLINE void project_centres(const View& view, const Geometry& in, const Which& which, Projection& p) {
+  place_lanes(view, in, which, p);
+  p.fine &= p.z > kNear;
+  p.inverse_z = 1.0f / p.z;
+  const Vec u = p.x * p.inverse_z, v = p.y * p.inverse_z;
+  p.u_free = (u >= view.u_low) & (u <= view.u_high);
+  p.v_free = (v >= view.v_low) & (v <= view.v_high);
+  p.u = clamp_vec(u, splat_vec(view.u_low), splat_vec(view.u_high));
+  p.v = clamp_vec(v, splat_vec(view.v_low), splat_vec(view.v_high));
+  p.screen_x = view.fx * u + view.cx;
+  p.screen_y = view.fy * v + view.cy;
+}
+
+// Whether any of the Gaussians may touch the picture: the rows of J have the lengths fx sqrt(1 + u^2) / z and
+// fy sqrt(1 + v^2) / z, and no Gaussian is longer than its largest scale.
+RF_INLINE bool may_be_seen(const View& view, const Vec& opacity, const Projection& p) {
+  constexpr float kReach2 = 11.09f;  // no Gaussian reaches further than sqrt(2 ln 255) standard deviations
+  const Vec scale = max_vec(p.s[0], max_vec(p.s[1], p.s[2])) * p.inverse_z, scale2 = scale * scale * (1.01f * kReach2);
+  const Vec wide = sqrt_vec(scale2 * (view.fx * view.fx) * (1.0f + p.u * p.u) + kReach2 * kBlur) + 1.0f;
+  const Vec tall = sqrt_vec(scale2 * (view.fy * view.fy) * (1.0f + p.v * p.v) + kReach2 * kBlur) + 1.0f;
+  const Vec width = splat_vec(static_cast<float>(view.width)), height = splat_vec(static_cast<float>(view.height));
+  const IntVec beside = (p.screen_x + wide < 0.0f) | (p.screen_x - wide > width) | (p.screen_y + tall < 0.0f) |
+                        (p.screen_y - tall > height);
+  return (bits_of(p.fine & (opacity >= kAlphaMin)) & ~bits_of(beside)) != 0;
+}
+
+// The rest of the projection, after the centres.
+template <class Which>
+RF_INLINE void project_shapes(const View& view, const Geometry& in, const Which& which, Projection& p) {
+  const float* w = view.rotation;
+  turn_lanes(in, which, p);
   const Vec jx = view.fx * p.inverse_z, jy = view.fy * p.inverse_z;
   for (int col = 0; col < 3; ++col) {
     p.t[col] = jx * (w[col] - p.u * w[6 + col]);

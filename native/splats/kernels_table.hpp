@@ -8,11 +8,13 @@
 #include "splats/kernels_pinhole.hpp"
 #include "splats/kernels_shade.hpp"
 #include "splats/kernels_shapes.hpp"
+#include "splats/kernels_sphere.hpp"
 
 #define RF3DGS_DEFINE_KERNELS(function, name)                                                                  \
   namespace rf3dgs {                                                                                           \
   const Kernels& function() {                                                                                  \
-    static constexpr Kernels table = {name, {pinhole_kernels(), {}}, ::harmonics, ::harmonics_backward,        \
+    static constexpr Kernels table = {name, {pinhole_kernels(), sphere_kernels()},                              \
+                                      ::harmonics, ::harmonics_backward,                                       \
                                       ::ssim_row, ::ssim_gradient_row, ::l1_row, ::l1_gradient_row,            \
                                       ::target_row,                                                            \
                                       {::shade, ::shade_plain, ::update_harmonics, ::update_shapes,           \

@@ -164,6 +164,7 @@ std::unique_ptr<Scene> rasterize(const View& view, size_t count, const Geometry&
                                  float* picture, float* weight, float* radii, float* max_weight) {
   auto scene = std::make_unique<Scene>();
   scene->view = view;
+  if (view.kind == Kind::sphere) scene->view.sphere = sphere_grid(scene->memory->sphere, view.width, view.height);
   scene->gaussians = count;
   scene->channels = channels;
   scene->gate = gate;

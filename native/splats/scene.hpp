@@ -6,6 +6,7 @@
 
 #include "core/buffer.hpp"
 #include "splats/kernels.hpp"
+#include "splats/sphere_grid.hpp"
 
 namespace rf3dgs {
 
@@ -15,6 +16,7 @@ constexpr size_t kChunk = 2048;
 // Places number the visible splats: chunk * kChunk for the first of a chunk, gaps behind the last. They keep the order of
 // the Gaussians.
 struct SceneMemory {
+  SphereMemory sphere;
   Buffer<uint32_t> chunk_visible;  // [chunk] visible splats
   Buffer<float> splats;            // [place, splat_floats]
   Buffer<uint32_t> sources;        // [place] indices among the caller's Gaussians

@@ -11,7 +11,6 @@ from tests.splats.conformance import CASES, check, check_resampled
 from rf3dgs.splats.backends.core import native_core
 
 ROOT = Path(__file__).parents[2]
-NATIVE = [name for name, case in CASES.items() if case.view == "pinhole"]
 ACROSS = [
     "pinhole, 3 channels",
     "pinhole, 11 channels",
@@ -27,7 +26,7 @@ def test_the_reference_in_float32_agrees_with_itself_in_float64(name: str):
 
 
 @pytest.mark.skipif(native_core() is None, reason="the native core was not built")
-@pytest.mark.parametrize("name", NATIVE)
+@pytest.mark.parametrize("name", CASES)
 def test_the_native_core_agrees_with_the_reference(name: str):
     check(CASES[name], "native")
 

@@ -8,13 +8,14 @@ import torch
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, Panorama, equirect_grid, pinhole_grid, sample_grid
+from rf3dgs.splats.backends.core import native_core
 from rf3dgs.splats.constants import BLUR
 from rf3dgs.splats.projection import pixel_area, project_sphere, sphere_directions, tangent_axes
 from rf3dgs.splats.raster import Raster
 from rf3dgs.splats.rasterize import rasterize
 
 F64 = torch.float64
-BACKENDS = ["reference"]
+BACKENDS = ["reference", "native"]
 
 
 def draw(backend: str, tensors: list[torch.Tensor], view: Camera | Panorama) -> Raster:
@@ -168,3 +169,32 @@ def test_the_projection_turns_with_the_world():
     round_one = (1 / distance**2 + BLUR * pixel_area(view))[:, None, None] * torch.eye(2, dtype=F64)
     torch.testing.assert_close(covariance, round_one, rtol=1e-5, atol=1e-7)
     assert float((axes @ direction[:, :, None]).abs().max()) < 1e-9
+
+
+@pytest.mark.skipif(native_core() is None, reason="the native core was not built")
+@pytest.mark.parametrize(("width", "height"), [(360, 180), (97, 33), (54, 27), (7, 3), (40, 200)])
+def test_no_contribution_above_the_cut_is_lost_by_the_lists_of_tiles(width: int, height: int):
+    """Gaussians of all sizes and shapes, also over the poles and the seam, one by one against all pixels."""
+    generator = torch.Generator().manual_seed(width)
+    view = Panorama.of(Pose.look_at((0.3, 0.2, 0.1), (1.0, 0.7, 0.4)), equirect_grid(width, height))
+    count = 120
+    directions = torch.randn(count, 3, generator=generator)
+    directions[0::4] *= torch.tensor([0.05, 1.0, 0.05])
+    directions[1::4] *= torch.tensor([0.002, 1.0, 0.002])
+    directions[2::4] = directions[2::4] * torch.tensor([0.02, 1.0, 0.0]) - torch.tensor([0.0, 0.0, 1.0])
+    distance = 10 ** (2 * torch.rand(count, 1, generator=generator) - 1)
+    away = distance * torch.nn.functional.normalize(directions, dim=-1)
+    spread = 10 ** (3.5 * torch.rand(count, 1, generator=generator) - 3) * distance
+    tensors = [
+        away @ view.viewmat[:3, :3] + view.position,
+        torch.randn(count, 4, generator=generator),
+        spread * torch.exp(1.2 * torch.randn(count, 3, generator=generator)),
+        0.01 + 0.99 * torch.rand(count, generator=generator),
+        torch.ones(count, 1),
+    ]
+    for index in range(count):
+        one = [tensor[index : index + 1] for tensor in tensors]
+        found = rasterize(*one, view, backend="native").weight
+        expected = rasterize(*(tensor.double() for tensor in one), view, backend="reference").weight
+        clear = (expected - 1 / 255).abs() > 1e-6
+        torch.testing.assert_close(found[clear].double(), expected[clear], atol=3e-5, rtol=0)

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rf3dgs.core.errors import InputError, MissingDependencyError
-from rf3dgs.core.grids import Camera, View
+from rf3dgs.core.errors import MissingDependencyError
+from rf3dgs.core.grids import Camera, Panorama, View
 from rf3dgs.splats.backends.core import native_core, native_failure, thread_count
+from rf3dgs.splats.projection import project_sphere
 from rf3dgs.splats.raster import Raster
 
 
@@ -51,18 +52,19 @@ class _Rasterize(torch.autograd.Function):
         values: Tensor,
         background: Tensor | None,
         offset: Tensor | None,
-        camera: Camera,
+        view: View,
         gate: float | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         inputs = [None if tensor is None else _plain(tensor) for tensor in (means, quats, scales, opacities, values)]
         fill = None if background is None else _plain(background)
         shift = None if offset is None else _plain(offset)
-        picture = torch.empty(camera.height, camera.width, values.shape[1])
-        weight = torch.empty(camera.height, camera.width)
+        picture = torch.empty(view.height, view.width, values.shape[1])
+        weight = torch.empty(view.height, view.width)
         radii = torch.empty(len(means))
-        viewmat, K = (_plain(matrix).float() for matrix in (camera.viewmat, camera.K))
+        viewmat = _plain(view.viewmat).float()
+        K = _plain(view.K).float() if isinstance(view, Camera) else None
         scene = core().rasterize(*inputs, viewmat, K, fill, shift, gate, picture, weight, radii, None, thread_count())
-        ctx.scene = scene
+        ctx.scene, ctx.view = scene, view
         ctx.save_for_backward(*inputs, shift, picture, weight)
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
@@ -79,21 +81,51 @@ class _Rasterize(torch.autograd.Function):
         of_weight = None if of_weight is None else _plain(of_weight)
         needs = ctx.needs_input_grad
         means, quats, scales, opacities, values = inputs
-        to_means = torch.zeros_like(means) if needs[0] else None
-        to_quats = torch.zeros_like(quats) if needs[1] else None
-        to_scales = torch.zeros_like(scales) if needs[2] else None
+        view = ctx.view
+        flat = isinstance(view, Camera)
+        to_means = torch.zeros_like(means) if needs[0] and flat else None
+        to_quats = torch.zeros_like(quats) if needs[1] and flat else None
+        to_scales = torch.zeros_like(scales) if needs[2] and flat else None
+        to_sphere = torch.zeros(len(means), 9) if any(needs[:3]) and not flat else None
         to_opacities = torch.zeros_like(opacities) if needs[3] else None
         to_values = torch.zeros_like(values) if needs[4] else None
         to_offset = torch.zeros_like(shift) if needs[6] else None
-        outputs = (to_values, to_opacities, to_means, to_quats, to_scales, to_offset)
+        outputs = (to_values, to_opacities, to_means, to_quats, to_scales, to_offset, to_sphere)
         core().rasterize_backward(
             ctx.scene, *inputs[:4], shift, picture, weight, of_picture, of_weight, *outputs, thread_count()
         )
+        if to_sphere is not None and isinstance(view, Panorama):
+            to_means, to_quats, to_scales = _through_sphere(means, quats, scales, view, to_sphere)
         to_background = None
         if needs[5]:
             to_background = torch.einsum("hwc,hw->c", of_picture, 1 - weight)
         result = (to_means, to_quats, to_scales, to_opacities, to_values, to_background, to_offset)
         return (*(gradient if need else None for gradient, need in zip(result, needs, strict=False)), None, None)
+
+
+def _through_sphere(
+    means: Tensor, quats: Tensor, scales: Tensor, view: Panorama, gradients: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients of means, quats and scales from those `[gaussian, 9]` of what the sphere's splats are drawn with.
+
+    These are of M = E^T Sigma2^-1 E (xx, xy, xz, yy, yz, zz of a symmetric matrix) and of the direction, and go on
+    through `projection.project_sphere` for the Gaussians that have any.
+    """
+    index = (gradients != 0).any(-1).nonzero().squeeze(-1)
+    means_of, quats_of, scales_of = inputs = [
+        tensor[index].double().requires_grad_() for tensor in (means, quats, scales)
+    ]
+    with torch.enable_grad():
+        direction, axes, covariance, _ = project_sphere(means_of, quats_of, scales_of, view)
+        shape = axes.mT @ torch.linalg.inv(covariance) @ axes
+        upper = gradients[index][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].double().reshape(-1, 3, 3)
+        loss = (upper * shape).sum() + (gradients[index][:, 6:].double() * direction).sum()
+    of_means, of_quats, of_scales = torch.autograd.grad(loss, inputs)
+    return (
+        torch.zeros_like(means).index_copy_(0, index, of_means.float()),
+        torch.zeros_like(quats).index_copy_(0, index, of_quats.float()),
+        torch.zeros_like(scales).index_copy_(0, index, of_scales.float()),
+    )
 
 
 def rasterize_native(
@@ -109,8 +141,6 @@ def rasterize_native(
     depth_gate: float | None = None,
 ) -> Raster:
     """Blended channels of `rasterize` by the native core; see there."""
-    if not isinstance(view, Camera):
-        raise InputError('the native backend draws cameras alone; use backend="reference" for panoramas')
     arguments = (means, quats, scales, opacities, values, background, screen_offset, view, depth_gate)
     return Raster(*_Rasterize.apply(*arguments))  # type: ignore[misc]
 
