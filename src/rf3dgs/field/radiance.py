@@ -10,13 +10,13 @@ has the channels
 and `decode` makes power, delay and departure of it. The line of sight is not here: see `field.sources`.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from rf3dgs.core.errors import InputError
-from rf3dgs.core.grids import Camera
+from rf3dgs.core.grids import View
 from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.spectra.codec import DbWindow, PaperEncoding
 from rf3dgs.splats.gaussians import Gaussians
@@ -105,33 +105,6 @@ class Surface:
             delay_span,
         )
 
-    def select(self, index: Tensor) -> "Surface":
-        """The surface of the Gaussians `index` `[n]`; differentiable in the harmonics and opacities."""
-        names = ("means", "quats", "log_scales", "logit_opacities", "gain_sh", "csi_sh")
-        return replace(self, **{name: getattr(self, name)[index] for name in names})
-
-
-def in_view(means: Tensor, reach: Tensor, camera: Camera) -> Tensor:
-    """Indices of the Gaussians that may touch the picture: `means` `[N, 3]`, `reach` `[N]` their radius [m].
-
-    Conservative: a ball of that radius meets the pyramid of view. Geometry is frozen, so this needs no gradient.
-    """
-    x, y, z = (means @ camera.viewmat[:3, :3].mT + camera.viewmat[:3, 3]).unbind(-1)
-    keep = z > -reach
-    for across, focal, centre, size in (
-        (x, camera.K[0, 0], camera.K[0, 2], camera.width),
-        (y, camera.K[1, 1], camera.K[1, 2], camera.height),
-    ):
-        low, high = float(centre / focal), float((size - centre) / focal)
-        keep &= (across - high * z) < reach * (1 + high * high) ** 0.5
-        keep &= (-across - low * z) < reach * (1 + low * low) ** 0.5
-    return keep.nonzero().squeeze(-1)
-
-
-def reach_of(scales: Tensor) -> Tensor:
-    """Radius [m] beyond which a Gaussian `[N, 3]` of full opacity falls below 1/255, with room for the dilation."""
-    return 3.5 * scales.amax(-1) + 0.05
-
 
 def gain_values(gain_sh: Tensor, directions: Tensor) -> Tensor:
     """Gain `[N, 1]` in window units that Gaussians with `gain_sh` `[N, K]` show along `[N, 3]`."""
@@ -159,15 +132,15 @@ def csi_values(surface: Surface, centre: Tensor, directions: Tensor) -> Tensor:
     return csi_prior(surface.means, surface.tx, centre) + evaluate(surface.csi_sh, directions)
 
 
-def picture_of(surface: Surface, camera: Camera, *, csi: bool = True, backend: Backend = "auto") -> Tensor:
+def picture_of(surface: Surface, view: View, *, csi: bool = True, backend: Backend = "auto") -> Tensor:
     """The channels `[row, col, 2 + CSI]` described above, without gradients; `csi=False` gives the first two alone."""
     with torch.no_grad():
-        seen = surface.select(in_view(surface.means, reach_of(surface.scales), camera))
-        directions = view_directions(seen.means, camera.position)
-        values = gain_values(seen.gain_sh, directions)
+        directions = view_directions(surface.means, view.position)
+        values = gain_values(surface.gain_sh, directions)
         if csi:
-            values = torch.cat((values, csi_values(seen, camera.position, directions)), -1)
-        raster = rasterize(seen.means, seen.quats, seen.scales, seen.opacities, values, camera, backend=backend)
+            values = torch.cat((values, csi_values(surface, view.position, directions)), -1)
+        shape = (surface.means, surface.quats, surface.scales, surface.opacities)
+        raster = rasterize(*shape, values, view, backend=backend)
     return torch.cat((raster.values[..., :1], raster.weight[..., None], raster.values[..., 1:]), -1)
 
 

@@ -13,10 +13,9 @@ from torch import Tensor
 
 from rf3dgs.channel.paths import Paths
 from rf3dgs.core.angles import angles_of
-from rf3dgs.core.cube import face_cameras, sample_faces
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import Camera, DirectionGrid, equirect_grid
+from rf3dgs.core.grids import DirectionGrid, equirect_grid, sample_grid, view_of
 from rf3dgs.field.radiance import Radiance, Surface, decode, picture_of
 from rf3dgs.field.sources import Blockers, PointSource
 from rf3dgs.spectra.codec import DbWindow
@@ -71,7 +70,8 @@ class RadioField:
     def render(self, pose: Pose, grid: DirectionGrid, *, csi: bool = True) -> Spectrum:
         """The spectrum at one pose or a batch `[*batch]`: linear power, and delay [s] and departure per direction.
 
-        Pinhole grids are rasterized as they are, others through six cube faces of the grid's own pixel size.
+        Pinhole and equirectangular grids are rasterized as they are; a list of directions is interpolated from a sphere
+        whose pixels are half a lobe wide.
         `csi=False` leaves delay and departure out, which is faster.
         """
         batch = pose.batch_shape
@@ -159,12 +159,12 @@ class RadioField:
         return Radiance(power, delay, torch.nn.functional.normalize(weighted_aod / scale, dim=-1, eps=1e-9))
 
     def _channels(self, pose: Pose, grid: DirectionGrid, csi: bool) -> Tensor:
-        if grid.kind == "pinhole":
-            return picture_of(self.surface, Camera.of(pose, grid), csi=csi, backend=self.backend)
-        spacing = grid.spacing if grid.kind == "equirect" else 0.5 * self.instrument.lobe
-        size = max(8, math.ceil(0.5 * math.pi / spacing - 1e-3))
-        faces = [picture_of(self.surface, camera, csi=csi, backend=self.backend) for camera in face_cameras(pose, size)]
-        return sample_faces(torch.stack(faces), size, grid.directions)
+        if grid.kind != "list":
+            return picture_of(self.surface, view_of(pose, grid), csi=csi, backend=self.backend)
+        rows = max(8, math.ceil(2 * math.pi / self.instrument.lobe))
+        sphere = equirect_grid(2 * rows, rows)
+        picture = picture_of(self.surface, view_of(pose, sphere), csi=csi, backend=self.backend)
+        return sample_grid(picture, sphere, grid.directions)
 
     def _paths_of_one(self, pose: Pose, strongest: int) -> Tensor:
         """Rows `[strongest, 9]`: gain, delay, arrival (3), departure (3), order; a row of zero gain is padding."""

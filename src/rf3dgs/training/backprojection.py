@@ -25,7 +25,6 @@ LEAST_WEIGHT = 0.02
 def ridge_start(
     surface: Surface,
     views: Sequence[RadioView],
-    visible: Sequence[Tensor],
     *,
     degree: int,
     ridge: float,
@@ -34,8 +33,8 @@ def ridge_start(
 ) -> tuple[Tensor, Tensor]:
     """Gain harmonics `[N, K]` and, for encoding "vector", CSI harmonics `[N, 4, 4]` that explain the views best.
 
-    `visible` are the Gaussians `[n]` that may touch each view. Each pass solves for what the one before left over.
-    `ridge` counts in observations: how many of them the neighbourhood's solution is worth.
+    Each pass solves for what the one before left over. `ridge` counts in observations: how many of them the
+    neighbourhood's solution is worth.
     """
     cells = [_cells(surface, cell) for cell in CELLS]
     with_csi = surface.encoding == "vector" and all(view.csi is not None for view in views)
@@ -46,13 +45,13 @@ def ridge_start(
         current = replace(surface, gain_sh=gain.solution[..., 0], csi_sh=csi.solution)
         gain.right.zero_()
         csi.right.zero_()
-        for index, view in zip(visible, views, strict=True):
-            sums, directions = _leftover(current.select(index), view, with_csi, backend)
+        for view in views:
+            sums, directions = _leftover(current, view, with_csi, backend)
             total = sums[:, 0]
             weight = total / (total + HALF_WEIGHT)
-            usable = weight > LEAST_WEIGHT
-            chosen, sums, total, weight = index[usable], sums[usable], total[usable], weight[usable]
-            harmonics = basis(directions[usable], max(degree, 1))
+            chosen = (weight > LEAST_WEIGHT).nonzero().squeeze(-1)
+            sums, total, weight = sums[chosen], total[chosen], weight[chosen]
+            harmonics = basis(directions[chosen], max(degree, 1))
             gain.add(chosen, harmonics[:, :size], sums[:, 2:3] / total[:, None], weight, both=number == 0)
             if with_csi:
                 power = sums[:, 1]
@@ -64,18 +63,20 @@ def ridge_start(
     return gain.solution[..., 0], csi.solution
 
 
-def _leftover(seen: Surface, view: RadioView, with_csi: bool, backend: Backend) -> tuple[Tensor, Tensor]:
-    """Sums `[n, 3 (+ 4)]` over the pixels that each Gaussian `seen` in a view decides, and directions `[n, 3]`.
+def _leftover(surface: Surface, view: RadioView, with_csi: bool, backend: Backend) -> tuple[Tensor, Tensor]:
+    """Sums `[N, 3 (+ 4)]` over the pixels that each Gaussian of the surface decides, and directions `[N, 3]`.
 
     The sums are of 1, of the target gain, of what the gain lacks, and of what delay and departure lack times the target
     gain: the gradient of `(rendering * those pictures).sum()` in the Gaussians' values.
     """
-    directions = view_directions(seen.means, view.camera.position)
-    values = torch.cat((torch.zeros(len(seen), 2), gain_values(seen.gain_sh, directions)), -1)
+    here = view.view.position
+    directions = view_directions(surface.means, here)
+    values = torch.cat((torch.zeros(len(surface), 2), gain_values(surface.gain_sh, directions)), -1)
     if with_csi:
-        values = torch.cat((values, csi_values(seen, view.camera.position, directions)), -1)
+        values = torch.cat((values, csi_values(surface, here, directions)), -1)
     values.requires_grad_()
-    raster = rasterize(seen.means, seen.quats, seen.scales, seen.opacities, values, view.camera, backend=backend)
+    shape = (surface.means, surface.quats, surface.scales, surface.opacities)
+    raster = rasterize(*shape, values, view.view, backend=backend)
     picture = raster.values.detach()
     reached = view.keep * view.gain
     parts = [view.keep, reached, view.keep * (view.gain - picture[..., 2])]

@@ -11,7 +11,7 @@ class RadioConfig:
     """The radio stage: opacity and CSI-encoded harmonics on frozen geometry."""
 
     steps: int = 1000
-    """Iterations; each takes one training position and one of its pictures (a cube face, or its pinhole picture)."""
+    """Iterations; each takes the picture of one training position, a whole sphere or a pinhole's."""
     csi_every: int = 2
     """Delay and departure are trained in every n-th iteration; 0 leaves them at their geometric prior."""
     seed: int = 0
@@ -25,8 +25,6 @@ class RadioConfig:
     "surface": the Gaussians must show it too, as in the paper."""
     degree: int = 3
     """Degree of the gain's harmonics."""
-    face_size: int | None = None
-    """Pixels along a cube face on which spheres are trained; None takes the sphere's own pixel size."""
     floor_db: float | None = None
     """Lower end of the field's dB window; None takes it from the training spectra."""
     ceil_db: float | None = None

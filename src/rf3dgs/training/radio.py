@@ -77,7 +77,6 @@ def fit_radio(
         window,
         sources=[(source, seen) for source in sources],
         encoding=PaperEncoding(window, span) if config.encoding == "paper" else None,
-        face_size=config.face_size,
     )
     stage = RadioStage(bare, views, config)
     pose = spectra.pose

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.units import SPEED_OF_LIGHT
-from rf3dgs.field.radiance import NANOSECOND, Surface, bounce, in_view, reach_of
+from rf3dgs.field.radiance import NANOSECOND, Surface, bounce
 from rf3dgs.splats.compositing import Compositing
 from rf3dgs.splats.harmonics import C0
 from rf3dgs.splats.rates import Rates
@@ -56,7 +56,7 @@ class RadioStage:
         """One view: its gain, and in every n-th iteration its delay and departure."""
         config = self.config
         number = view_at(config.seed, iteration, len(self.views))
-        camera = self.views[number].camera
+        view = self.views[number].view
         fall = config.lr_final ** (iteration / max(1, config.steps))
         level, bands, csi = (rate / C0 * fall for rate in (config.lr_level, config.lr_harmonics, config.lr_csi))
         others = self.gain.channels - 1
@@ -65,13 +65,13 @@ class RadioStage:
             level=(level, *[csi] * others),
             bands=(bands, *[csi] * others),
         )
-        loss = self.gain.step(camera, self.targets[number], rates, ssim_weight=config.ssim_weight, shrink=config.shrink)
+        loss = self.gain.step(view, self.targets[number], rates, ssim_weight=config.ssim_weight, shrink=config.shrink)
         if self.csi is not None and iteration % config.csi_every == 0:
             target = self.csi_targets[number]
             if target is not None:
                 each = tuple((csi / CSI_UNITS).tolist())
                 rates = Rates(level=each, bands=each)
-                error = self.csi.step(camera, target, rates, ssim_weight=0.0, compositing=MEANS)
+                error = self.csi.step(view, target, rates, ssim_weight=0.0, compositing=MEANS)
                 loss += self.csi.channels * error
         return loss
 
@@ -104,12 +104,8 @@ class RadioStage:
         if config.start == "grey":
             return bare.gain_sh, bare.csi_sh
         degree = min(config.degree, START_DEGREE) if config.start == "ridge" else 0
-        reach = reach_of(bare.scales)
-        visible = [in_view(bare.means, reach, view.camera) for view in self.views]
         with torch.enable_grad():
-            found, csi = ridge_start(
-                bare, self.views, visible, degree=degree, ridge=config.ridge, backend=config.backend
-            )
+            found, csi = ridge_start(bare, self.views, degree=degree, ridge=config.ridge, backend=config.backend)
         gain_sh = torch.zeros_like(bare.gain_sh)
         gain_sh[:, : found.shape[1]] = found
         return gain_sh, csi

@@ -1,7 +1,6 @@
-"""What the radio stage looks at: pictures of the training spectra as cameras see them, without the point sources.
+"""What the radio stage looks at: the training spectra as pictures, without the point sources.
 
-A pinhole spectrum is one view; a sphere becomes six cube faces. Gains are brought into the field's dB window first and
-interpolated there, so that a rendering, which is interpolated in the same way, can reach them.
+Every spectrum is one picture on its own grid, a pinhole's or the whole sphere's. Gains are in the field's dB window.
 """
 
 from collections.abc import Sequence
@@ -11,9 +10,8 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.angles import angle_between
-from rf3dgs.core.cube import device_from_faces, face_cameras, face_grid
 from rf3dgs.core.errors import InputError
-from rf3dgs.core.grids import Camera, sample_grid
+from rf3dgs.core.grids import View, view_of
 from rf3dgs.field.sources import PointSource
 from rf3dgs.spectra.codec import DbWindow, PaperEncoding
 from rf3dgs.spectra.spectrum import Spectrum
@@ -26,12 +24,12 @@ MASKED_SHARE = 0.3
 class RadioView:
     """One picture to learn from.
 
-    gain `[row, col]`: window units. keep `[row, col]`: solid angle of the pixel relative to the picture's mean, zero
-    where a point source hides the surface. csi `[row, col, C]`: the channels of the surface's encoding (delay [ns] and
-    departure, or the paper's three), or None where the spectra have none.
+    view: what it shows. gain `[row, col]`: window units. keep `[row, col]`: solid angle of the pixel relative to the
+    picture's mean, zero where a point source hides the surface. csi `[row, col, C]`: the channels of the surface's
+    encoding (delay [ns] and departure, or the paper's three), or None where the spectra have none.
     """
 
-    camera: Camera
+    view: View
     gain: Tensor
     keep: Tensor
     csi: Tensor | None
@@ -43,7 +41,6 @@ def radio_views(
     *,
     sources: Sequence[tuple[PointSource, Tensor]] = (),
     encoding: PaperEncoding | None = None,
-    face_size: int | None = None,
 ) -> list[RadioView]:
     """The views of `spectra` `[position, row, col]`; `sources`: point sources and where each is seen `[position]`.
 
@@ -51,41 +48,14 @@ def radio_views(
     """
     if spectra.grid.kind == "list":
         raise InputError("the radio stage needs pinhole or equirectangular spectra; got a list of directions")
-    pinhole = spectra.grid.kind == "pinhole"
-    size = face_size or max(8, round(spectra.grid.width / 4))
-    grid = spectra.grid if pinhole else face_grid(size)
-    area = grid.solid_angle / grid.solid_angle.mean()
-    views = []
-    for index in range(len(spectra)):
-        one = spectra[index]
-        channels = _channels(one, window, [source for source, seen in sources if bool(seen[index])], encoding)
-        if pinhole:
-            pictures, cameras = [channels], [Camera.of(one.pose, grid)]
-        else:
-            cameras = face_cameras(one.pose, size)
-            pictures = [sample_grid(channels, one.grid, grid.directions @ turn.mT) for turn in device_from_faces()]
-        for picture, camera in zip(pictures, cameras, strict=True):
-            keep = area * (picture[..., 1] > 0.999)
-            csi = picture[..., 2:] if encoding else _weighted_mean(picture[..., 2:])
-            views.append(RadioView(camera, picture[..., 0], keep, csi if picture.shape[-1] > 2 else None))
-    return views
+    hidden = [[source for source, seen in sources if bool(seen[index])] for index in range(len(spectra))]
+    return [_view(spectra[index], window, hidden[index], encoding) for index in range(len(spectra))]
 
 
-def _weighted_mean(sums: Tensor) -> Tensor:
-    """Delay and unit departure of interpolated power times (1, delay, departure)."""
-    mean = sums[..., 1:] / sums[..., :1].clamp_min(1e-30) * (sums[..., :1] > 0)
-    return torch.cat((mean[..., :1], torch.nn.functional.normalize(mean[..., 1:], dim=-1, eps=1e-9)), -1)
-
-
-def _channels(
-    one: Spectrum, window: DbWindow, sources: Sequence[PointSource], encoding: PaperEncoding | None
-) -> Tensor:
-    """Window gain, 1 where the surface decides, and the paper's CSI channels or power over the floor times (1, delay
-    [ns], departure). Point sources are taken out, and the pixels that they rule are marked by 0.
-    """
-    power = one.power.double()
-    whole = torch.ones_like(power)
-    floor = 10.0 ** (window.floor_db / 10.0)
+def _view(one: Spectrum, window: DbWindow, sources: Sequence[PointSource], encoding: PaperEncoding | None) -> RadioView:
+    """The picture of one spectrum: point sources are taken out, and the pixels that they rule do not count."""
+    area = one.grid.solid_angle / one.grid.solid_angle.mean()
+    power, whole = one.power.double(), torch.ones_like(one.power, dtype=torch.bool)
     has_csi = one.delay is not None and one.aod is not None
     delay = one.delay.double() * power if one.delay is not None else power
     aod = one.aod.double() * power[..., None] if one.aod is not None else power[..., None]
@@ -94,16 +64,16 @@ def _channels(
         beam = source.beam(one.directions, here, one.instrument)
         share = (beam * source.gain(here, one.frequency)).double()
         angle = angle_between(one.directions, source.arrival(here).expand_as(one.directions))
-        whole = whole * ((share < MASKED_SHARE * one.power) & (angle > MASKED_LOBES * one.instrument.lobe))
+        whole = whole & (share < MASKED_SHARE * one.power) & (angle > MASKED_LOBES * one.instrument.lobe)
         power = power - share
         delay = delay - share * source.delay(here)
         aod = aod - share[..., None] * source.departure(here)
-    power = power.clamp_min(0.0)
-    parts = [window.encode(power.float())[..., None], whole[..., None]]
+    csi = None
     if has_csi and encoding is not None:
-        parts += [encoding.encode(one)[..., 1:]]
+        csi = encoding.encode(one)[..., 1:]
     elif has_csi:
-        reached = (power > 0) & (whole > 0)
-        parts += [(reached * part / floor)[..., None] for part in (power, delay * 1e9)]
-        parts += [reached[..., None] * aod / floor]
-    return torch.cat([part.float() for part in parts], -1)
+        reached = (power > 0) & whole
+        late = torch.where(reached, delay / torch.where(reached, power, 1.0) * 1e9, 0.0)
+        turned = torch.nn.functional.normalize(aod / torch.where(reached, power, 1.0)[..., None], dim=-1, eps=1e-9)
+        csi = torch.cat((late[..., None], turned * reached[..., None]), -1).float()
+    return RadioView(view_of(one.pose, one.grid), window.encode(power.clamp_min(0.0).float()), area * whole, csi)
