@@ -146,8 +146,7 @@ size_t project_sphere(const View& view, const Geometry& in, size_t begin, size_t
     const Neighbours which = {start, lanes};
     SphereProjection s;
     project_sphere_lanes(view, in, which, s);
-    Vec opacity;
-    which.template columns<1>(in.opacities, &opacity);
+    const Vec opacity = load_some(in.opacities + start, lanes);
     IntVec fine = s.p.fine & (opacity >= kAlphaMin) & is_finite(opacity);
     const Vec middle = 0.5f * (s.sxx + s.syy), half = 0.5f * (s.sxx - s.syy);
     const Vec major = middle + sqrt_vec(half * half + s.sxy * s.sxy);
