@@ -1,6 +1,6 @@
 """Learning rates of the radio stage: error of the gain against iterations, on the lobby's validation positions.
 
-    python -m benchmarks.quality.radio_presets [--presets fast paper best] [--steps 200 1000 3000] [--geometry FILE]
+    python -m benchmarks.quality.radio_presets [--presets fast paper best] [--steps 0 300 1000] [--geometry FILE]
 
 Geometry is sampled from the lobby's mesh, or read from a .ply such as the one that `rf3dgs demo` writes. Every preset
 is trained once for each number of steps, because its schedule ends with the run. Printed: root mean square and median
@@ -38,7 +38,7 @@ def gain_error(field: RadioField, truth: Spectrum) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--presets", nargs="+", default=["fast", "paper", "best"])
-    parser.add_argument("--steps", nargs="+", type=int, default=[200, 1000, 3000])
+    parser.add_argument("--steps", nargs="*", type=int, help="numbers of steps; a preset's own when missing")
     parser.add_argument("--geometry", type=Path, help="Gaussians to train on; the mesh's when missing")
     parser.add_argument("--count", type=int, default=40_000, help="Gaussians on the mesh")
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="settings that replace a preset's")
@@ -57,7 +57,7 @@ def main() -> None:
     print(f"{len(geometry):,} Gaussians, {len(train)} training positions, {len(validation)} validation positions")
     rows = []
     for name in options.presets:
-        for steps in options.steps:
+        for steps in options.steps or [RadioConfig.preset(name).steps]:
             config = replace(RadioConfig.preset(name, steps=steps), **changes)
             started = time.process_time()
             field = fit_radio(geometry, train, config)

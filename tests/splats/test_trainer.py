@@ -366,3 +366,10 @@ def test_drawing_alone_is_what_a_trainer_draws(channels: int, degree: int):
     assert (found.values - kept.values).abs().max() < 1e-5
     assert torch.equal(found.radii, kept.radii)
     assert_same_picture(found.values, exact.values)
+
+
+@pytest.mark.parametrize(("channels", "train", "expected"), [(1, ("opacity", "sh"), 264), (3, EVERYTHING, 740)])
+def test_memory_of_a_gaussian_is_as_stated(channels: int, train: tuple[str, ...], expected: int):
+    engine = Trainer(**cloud(100, channels=channels), train=train, backend="native")._engine
+    tensors = [*engine.memory.values(), *engine._activated.values()]
+    assert sum(tensor.nbytes for tensor in tensors) == 100 * expected

@@ -271,8 +271,10 @@ def test_presets_have_names_and_keep_the_seed():
 
 
 def test_the_core_and_its_specification_train_the_same_field(training):
+    """On Gaussians of which no two are equally deep: the order of those is rounding's."""
+    geometry = Gaussians.random(300, (0.2, 0.2, 0.2), (5.8, 4.8, 2.8), degree=0, seed=2)
     config = replace(QUICK, steps=24)
-    fields = [fit_radio(room(), training, replace(config, backend=backend)) for backend in ("native", "reference")]
+    fields = [fit_radio(geometry, training, replace(config, backend=backend)) for backend in ("native", "reference")]
     for name in ("gain_sh", "csi_sh", "logit_opacities"):
         found, expected = (getattr(field.surface, name) for field in fields)
-        assert (found - expected).norm() < 0.02 * expected.norm(), name
+        assert (found - expected).norm() < 1e-4 * expected.norm(), name

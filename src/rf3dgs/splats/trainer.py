@@ -42,7 +42,7 @@ class Trainer:
     as fixed: means get no gradient from the harmonics. Memory of the native engine: 4 bytes for every
     parameter, 8 (4) for its moments if it is trained, and 20 for the order and the activated scales and opacities; a
     Gaussian with 16 coefficients of one channel whose opacity is trained takes 264 bytes, with three channels and all
-    trained 748.
+    trained 740.
     """
 
     def __init__(
