@@ -7,7 +7,7 @@ of twice the size), and that room as it is, which one sees through. All carry a 
 vary over metres, another level for each direction of a wall and, in the lobby, for each colour. One version leaves out
 what spheres of 180x90 at 80 known positions do not show; another merges for those positions and carries the mean
 harmonics, as nothing is trained on it. Pictures are taken at positions that were not known: pinholes of 300x200 over
-90 degrees and spheres as six cube faces of 90x90. Errors are shares of the dB window (harmonics give window units);
+90 degrees and spheres of 360x180. Errors are shares of the dB window (harmonics give window units);
 depths are means over the weight. Times are CPU times of all threads, the mean over the pinholes of each one's least: a
 picture of one channel, harmonics included, and a training step with frozen geometry.
 
@@ -28,7 +28,6 @@ from torch import Tensor
 from benchmarks.speed.scenes import room
 from benchmarks.speed.timing import measure
 from rf3dgs.cli.facts import open_dataset, open_scene
-from rf3dgs.core.cube import face_cameras
 from rf3dgs.core.files import write_whole
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import View, equirect_grid, pinhole_grid, view_of
@@ -166,7 +165,7 @@ def main() -> None:
     ]
     views: dict[str, Sequence[View]] = {
         "pinhole": [view_of(pose, pinhole_grid(300, 200, 90.0)) for pose in poses],
-        "sphere": [camera for pose in poses for camera in face_cameras(pose, 90, margin=0)],
+        "sphere": [view_of(pose, equirect_grid(360, 180)) for pose in poses],
     }
     surroundings = [view_of(Pose(place), equirect_grid(180, 90)) for place in known]
     result: dict[str, object] = {"pixel_deg": options.pixel, "positions": POSITIONS, "held_out": options.held_out}

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rf3dgs.core.cube import face_cameras
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import matrix_from_quaternion, quaternion_from_matrix
-from rf3dgs.core.grids import Camera, View
+from rf3dgs.core.grids import View
 from rf3dgs.splats.backends.native import raise_to_weights_native
 from rf3dgs.splats.cells import shared_cells
 from rf3dgs.splats.gaussians import Gaussians
@@ -69,8 +68,8 @@ class Detail:
 def largest_weights(gaussians: Gaussians, views: Sequence[View], *, backend: Backend = "auto") -> Tensor:
     """The largest blending weight `[gaussian]`, 0..1, that each Gaussian has in any pixel of any view.
 
-    The native core finds it in the forward pass, of a panorama through its cube faces. Other backends draw a channel
-    for each Gaussian, which is for small scenes and the specification.
+    The native core finds it in the forward pass. Other backends draw a channel for each Gaussian, which is for small
+    scenes and the specification.
     """
     now = gaussians.detach()
     shape = now.means, now.quats, now.scales, now.opacities
@@ -78,8 +77,7 @@ def largest_weights(gaussians: Gaussians, views: Sequence[View], *, backend: Bac
     native = (pick_backend()[0] if backend == "auto" else backend) == "native"
     for view in views:
         if native:
-            for camera in [view] if isinstance(view, Camera) else face_cameras(view.pose, -(-view.width // 4)):
-                raise_to_weights_native(largest, shape, camera)
+            raise_to_weights_native(largest, shape, view)
             continue
         for some in torch.arange(len(now)).split(CHANNELS):
             one = torch.zeros(len(now), len(some)).index_put_((some, torch.arange(len(some))), torch.ones(len(some)))

@@ -145,14 +145,15 @@ def rasterize_native(
     return Raster(*_Rasterize.apply(*arguments))  # type: ignore[misc]
 
 
-def raise_to_weights_native(largest: Tensor, shape: tuple[Tensor, Tensor, Tensor, Tensor], camera: Camera) -> None:
+def raise_to_weights_native(largest: Tensor, shape: tuple[Tensor, Tensor, Tensor, Tensor], view: View) -> None:
     """Raise `largest` `[gaussian]` in place to the largest blending weight that each Gaussian has in one picture.
 
     `shape` are activated means, quats, scales and opacities.
     """
     inputs = [_plain(tensor) for tensor in shape]
-    viewmat, K = (_plain(matrix).float() for matrix in (camera.viewmat, camera.K))
-    size = camera.height, camera.width
+    viewmat = _plain(view.viewmat).float()
+    K = _plain(view.K).float() if isinstance(view, Camera) else None
+    size = view.height, view.width
     outputs = torch.empty(*size, 1), torch.empty(size), torch.empty_like(largest), largest
     values = torch.zeros(len(largest), 1)
     core().rasterize(*inputs, values, viewmat, K, None, None, None, *outputs, thread_count())
