@@ -1,5 +1,7 @@
 # make demo   set everything up and run the main job on the built-in lobby
 # make test   set everything up and run the tests
+# make test-isa  the core's tests with each of its instruction sets
+# make sanitize  the core under the sanitizers
 # make lint   formatting, types, import contract
 # make bench  speed of the splatting core against this machine's floor and the reference, measured in the same run
 # make twin   trace, photograph and train the built-in lobby afresh: the data that ships inside the package
@@ -17,7 +19,7 @@ OUT ?= out
 # Idle OpenMP threads sleep instead of spinning, which on two cores costs more than the work.
 export OMP_WAIT_POLICY ?= passive
 
-.PHONY: demo test test-slow lint format bench twin clean
+.PHONY: demo test test-isa test-slow sanitize lint format bench twin clean
 .DEFAULT_GOAL := demo
 
 $(BIN)/python:
@@ -44,6 +46,15 @@ demo: $(VENV)/package.stamp
 test: $(VENV)/test.stamp
 	$(BIN)/python -m pytest -m "not slow and not gpu"
 
+# The splatting core's tests with each of its instruction sets; a machine without one runs them with the next narrower.
+test-isa: $(VENV)/test.stamp
+	for set in portable avx2 avx512; do echo "RF3DGS_ISA=$$set"; \
+	  RF3DGS_ISA=$$set $(BIN)/python -m pytest tests/splats -q -m "not slow and not gpu" || exit 1; done
+
+# Hostile scenes under the address, undefined-behaviour and thread sanitizers, with each instruction set.
+sanitize: $(VENV)/test.stamp
+	PYTHON="$(BIN)/python" OUT="$(OUT)/sanitize" tools/sanitize.sh
+
 test-slow: $(VENV)/test.stamp
 	$(BIN)/python -m pytest -m "slow and not gpu"
 
@@ -59,6 +70,7 @@ format: $(VENV)/test.stamp
 
 bench: $(VENV)/test.stamp
 	$(BIN)/python -m benchmarks.speed.table --json $(OUT)/bench/table.json
+	$(BIN)/python -m benchmarks.speed.scaling --json $(OUT)/bench/scaling.json --figures $(OUT)/bench
 	$(BIN)/python -m pytest benchmarks/speed --benchmark-only --benchmark-columns=min,median,rounds
 
 twin: $(VENV)/test.stamp

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import cache
 
 from benchmarks.speed.floor import TWO_ZEN5_CORES, Machine, floor_ms
+from benchmarks.speed.scenes import merged_room, room
 from benchmarks.speed.subjects import Subject, rendering, training
 from benchmarks.speed.timing import Timing, measure, measure_run
 
@@ -27,13 +28,15 @@ class Row:
 
 
 ROWS = (
-    Row("render RGB, 50k", lambda: rendering(50_000), ratios=(2.5, 1.6)),
-    Row("render RGB, 100k", lambda: rendering(100_000), ratios=(2.5, 1.6)),
-    Row("render RGB, 200k", lambda: rendering(200_000), ratios=(2.5, 1.6)),
-    Row("frozen step RGB, 100k", lambda: training(100_000), ratios=(2.1, 1.3)),
-    Row("frozen step 1 ch, 100k", lambda: training(100_000, channels=1), ratios=(2.1, 1.3)),
-    Row("radio stage step RGB, 100k", lambda: training(100_000, views=RADIO_VIEWS), zen5_ms=(4.0, 2.5), run=True),
-    Row("full step RGB, 100k", lambda: training(100_000, frozen=False), zen5_ms=(11.0, 5.0)),
+    Row("render RGB, 50k", lambda: rendering(room(50_000)), ratios=(2.5, 1.6)),
+    Row("render RGB, 100k", lambda: rendering(room(100_000)), ratios=(2.5, 1.6)),
+    Row("render RGB, 200k", lambda: rendering(room(200_000)), ratios=(2.5, 1.6)),
+    Row("frozen step RGB, 100k", lambda: training(room(100_000)), ratios=(2.1, 1.3)),
+    Row("frozen step 1 ch, 100k", lambda: training(room(100_000, channels=1)), ratios=(2.1, 1.3)),
+    Row("radio stage step RGB, 100k", lambda: training(room(100_000), views=RADIO_VIEWS), zen5_ms=(4.0, 2.5), run=True),
+    Row("full step RGB, 100k", lambda: training(room(100_000), frozen=False), zen5_ms=(11.0, 5.0)),
+    Row("1M merged: render 1 ch", lambda: rendering(merged_room()), zen5_ms=(8.0, 5.0)),
+    Row("1M merged: frozen step 1 ch", lambda: training(merged_room()), zen5_ms=(20.0, 10.0)),
 )
 
 
@@ -78,7 +81,7 @@ def asked_ratios(row: Row, subject: Subject) -> tuple[float, float]:
 
 @cache
 def _frozen_step_on_zen5() -> float:
-    return _zen5_ms(training(100_000))
+    return _zen5_ms(training(room(100_000)))
 
 
 def _zen5_ms(subject: Subject) -> float:

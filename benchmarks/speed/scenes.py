@@ -1,12 +1,15 @@
 """A synthetic room of flattened Gaussians and views of it."""
 
 import math
+from functools import cache
 
 import torch
 from torch import Tensor
 
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, Panorama, equirect_grid, pinhole_grid
+from rf3dgs.splats.detail import level_of_detail
+from rf3dgs.splats.gaussians import Gaussians
 
 ROOM = (14.0, 15.0, 3.5)  # m
 
@@ -31,6 +34,20 @@ def room(count: int, *, channels: int = 3, seed: int = 0) -> dict[str, Tensor]:
     opacities = 0.1 + 0.88 * torch.rand(count, generator=generator)
     sh = 0.2 * torch.randn(count, 16, channels, generator=generator)
     return {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+
+
+@cache
+def merged_room(count: int = 1_000_000) -> dict[str, Tensor]:
+    """The room of `count` Gaussians of one channel, twice as large so that its walls are closed, at a level of detail
+    of one degree for receivers at 80 of `poses`.
+    """
+    scene = room(count, channels=1)
+    log_scales, logits = scene["scales"].log() + math.log(2.0), torch.logit(scene["opacities"])
+    whole = Gaussians(scene["means"], scene["quats"], log_scales, logits, scene["sh"])
+    places = torch.stack([pose.position for pose in poses(80)])
+    merged = level_of_detail(whole, places, pixel=math.radians(1.0)).gaussians
+    shapes = {"means": merged.means, "quats": merged.quats, "scales": merged.scales}
+    return shapes | {"opacities": merged.opacities, "sh": merged.sh}
 
 
 def poses(count: int, *, seed: int = 0) -> list[Pose]:

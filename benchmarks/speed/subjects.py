@@ -1,19 +1,22 @@
-"""What is timed: pictures and training steps of the synthetic room, with the work that each consists of."""
+"""What is timed: pictures and training steps, with the work that each consists of."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from benchmarks.speed.floor import Phase, Work, render, step
-from benchmarks.speed.scenes import cameras_of, panoramas, room
+from benchmarks.speed.scenes import cameras_of, panoramas
 from benchmarks.speed.timing import Task
-from rf3dgs.core.grids import View
-from rf3dgs.splats.harmonics import basis, evaluate, view_directions
-from rf3dgs.splats.image_loss import l1_ssim, l1_ssim_reference
+from rf3dgs.core.grids import Camera, View
 from rf3dgs.splats.rasterize import Backend, rasterize
+from rf3dgs.splats.rates import Rates
+from rf3dgs.splats.target import Target
+from rf3dgs.splats.trainer import Trainer
 
+# Small, so that what is drawn stays what it was.
+RATES = Rates(means=1e-6, quats=1e-6, log_scales=1e-6, logit_opacities=1e-5, level=1e-5, bands=1e-5)
 VIEWS = 16
 
 
@@ -26,57 +29,38 @@ class Subject:
     phases: list[Phase]
 
 
-def rendering(count: int, *, channels: int = 3, width: int = 300, height: int = 200, sphere: bool = False) -> Subject:
-    """Pictures of `count` Gaussians with harmonics of degree 3; `sphere`: of all directions, 360x180."""
-    scene = room(count, channels=channels)
+def rendering(scene: dict[str, Tensor], *, width: int = 300, height: int = 200, sphere: bool = False) -> Subject:
+    """Pictures of a scene with harmonics of degree 3; `sphere`: of all directions, 360x180."""
     cameras = panoramas(VIEWS) if sphere else cameras_of(VIEWS, width, height)
-    arguments = [scene[name] for name in ("means", "quats", "scales", "opacities")]
-
-    def draw(index: int) -> Tensor:
-        camera = cameras[index]
-        values = evaluate(scene["sh"], view_directions(scene["means"], camera.position), offset=0.5)
-        return rasterize(*arguments, values, camera, backend="native").values
-
-    return Subject(draw, VIEWS, render(work_of(scene, cameras)))
+    trainer = trainer_of(scene, frozen=True, backend="native")
+    return Subject(lambda index: trainer.draw(cameras[index]), VIEWS, render(work_of(scene, cameras)))
 
 
 def training(
-    count: int,
+    scene: dict[str, Tensor],
     *,
-    channels: int = 3,
     width: int = 300,
     height: int = 200,
     frozen: bool = True,
     views: int = VIEWS,
     backend: Backend = "native",
 ) -> Subject:
-    """Training steps of `count` Gaussians with L1 + SSIM and Adam; `frozen`: opacities and harmonics only."""
-    scene, cameras = room(count, channels=channels), cameras_of(views, width, height)
-    targets = torch.rand(views, height, width, channels, generator=torch.Generator().manual_seed(1))
-    learn = stepper(scene, frozen=frozen, backend=backend)
-    work = work_of(scene, cameras)
-    return Subject(lambda index: learn(cameras[index], targets[index]), views, step(work, frozen=frozen))
+    """Training steps of a scene with L1 + SSIM and Adam; `frozen`: opacities and harmonics only."""
+    cameras, channels = cameras_of(views, width, height), scene["sh"].shape[2]
+    generator = torch.Generator().manual_seed(1)
+    targets = [Target(torch.rand(height, width, channels, generator=generator)) for _ in range(views)]
+    trainer = trainer_of(scene, frozen=frozen, backend=backend)
+    phases = step(work_of(scene, cameras), frozen=frozen)
+    return Subject(lambda index: trainer.step(cameras[index], targets[index], RATES), views, phases)
 
 
-def stepper(scene: dict[str, Tensor], *, frozen: bool, backend: Backend) -> Callable[[View, Tensor], float]:
-    """A function that does one training step towards a target picture and returns its loss."""
-    means, quats, scales = (scene[name].clone().requires_grad_(not frozen) for name in ("means", "quats", "scales"))
-    logit = torch.logit(scene["opacities"]).requires_grad_()
-    sh = scene["sh"].clone().requires_grad_()
-    optimiser = torch.optim.Adam([logit, sh] if frozen else [means, quats, scales, logit, sh], lr=1e-3)
-    native = backend == "native"
-
-    def learn(camera: View, target: Tensor) -> float:
-        optimiser.zero_grad(set_to_none=True)
-        directions = view_directions(means.detach(), camera.position)
-        values = evaluate(sh, directions) if native else torch.einsum("gk,gkc->gc", basis(directions, 3), sh)
-        raster = rasterize(means, quats, scales, torch.sigmoid(logit), values + 0.5, camera, backend=backend)
-        loss = (l1_ssim if native else l1_ssim_reference)(raster.values, target)
-        loss.backward()
-        optimiser.step()
-        return float(loss.detach())
-
-    return learn
+def trainer_of(scene: dict[str, Tensor], *, frozen: bool, backend: Backend) -> Trainer:
+    """A trainer of opacities and harmonics, and of geometry unless that is `frozen`."""
+    return Trainer(
+        *(scene["means"], scene["quats"], scene["scales"].log(), torch.logit(scene["opacities"]), scene["sh"]),
+        train=("opacity", "sh") if frozen else ("geometry", "opacity", "sh"),
+        backend=backend,
+    )
 
 
 def work_of(scene: dict[str, Tensor], cameras: Sequence[View]) -> Work:
@@ -91,7 +75,7 @@ def work_of(scene: dict[str, Tensor], cameras: Sequence[View]) -> Work:
         pairs=sum(scene.pairs for scene in drawn) / len(drawn),
         pixels=cameras[0].width * cameras[0].height,
         channels=scene["sh"].shape[2],
-        kind="pinhole" if hasattr(cameras[0], "K") else "sphere",
+        kind="pinhole" if isinstance(cameras[0], Camera) else "sphere",
     )
 
 

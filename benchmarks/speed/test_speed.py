@@ -19,16 +19,16 @@ def time_views(benchmark, subject: Subject) -> None:
 
 @pytest.mark.parametrize("gaussians", [50_000, 100_000, 200_000])
 def test_render(benchmark, gaussians: int) -> None:
-    time_views(benchmark, rendering(gaussians))
+    time_views(benchmark, rendering(room(gaussians)))
 
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_frozen_step(benchmark, channels: int) -> None:
-    time_views(benchmark, training(100_000, channels=channels))
+    time_views(benchmark, training(room(100_000, channels=channels)))
 
 
 def test_full_step(benchmark) -> None:
-    time_views(benchmark, training(100_000, frozen=False))
+    time_views(benchmark, training(room(100_000), frozen=False))
 
 
 def test_harmonics(benchmark) -> None:

@@ -3,11 +3,11 @@
 #include <time.h>
 
 #include <algorithm>
-#include <atomic>
 #include <barrier>
 #include <chrono>
 #include <functional>
 #include <memory>
+#include <numeric>
 #include <thread>
 #include <vector>
 
@@ -47,34 +47,27 @@ double multiply_add_rate(const FloorKernels& kernels, int threads, double second
       best[rank] = std::max(best[rank], static_cast<double>(done) / (thread_cpu_seconds() - before));
     } while (seconds_since(start) < seconds);
   });
-  double total = 0.0;
-  for (const double rate : best) total += rate;
-  return total / threads;
+  return std::accumulate(best.begin(), best.end(), 0.0) / threads;
 }
 
 double bandwidth(const FloorKernels& kernels, Traffic traffic, int threads, size_t bytes, double seconds) {
   const size_t count = std::max<size_t>(bytes / sizeof(float) / threads, 1024);
-  std::vector<std::unique_ptr<float[]>> shares(threads);
-  std::atomic<bool> enough = false;
-  double fastest = 0.0;
-  Clock::time_point all_started = Clock::now(), round_started;
-  std::barrier ready(threads, [&]() noexcept { round_started = Clock::now(); });
-  std::barrier done(threads, [&]() noexcept {
-    const double moved = static_cast<double>(count * sizeof(float) * threads) * (traffic == Traffic::change ? 2.0 : 1.0);
-    fastest = std::max(fastest, moved / seconds_since(round_started));
-    enough = seconds_since(all_started) > seconds;
-  });
+  const double moved = static_cast<double>(count * sizeof(float)) * (traffic == Traffic::change ? 2.0 : 1.0);
+  std::vector<double> best(threads, 0.0);
+  std::barrier together(threads);
   on_threads(threads, [&](int rank) {
-    shares[rank] = std::make_unique<float[]>(count);
+    const std::unique_ptr<float[]> share(new float[count]());
     float sink = 0.0f;
-    while (!enough) {
-      ready.arrive_and_wait();
-      if (traffic == Traffic::read) kernels.read_all(shares[rank].get(), count, &sink);
-      if (traffic == Traffic::change) kernels.change_all(shares[rank].get(), count);
-      done.arrive_and_wait();
-    }
+    together.arrive_and_wait();
+    const Clock::time_point start = Clock::now();
+    do {
+      const double before = thread_cpu_seconds();
+      if (traffic == Traffic::read) kernels.read_all(share.get(), count, &sink);
+      if (traffic == Traffic::change) kernels.change_all(share.get(), count);
+      best[rank] = std::max(best[rank], moved / (thread_cpu_seconds() - before));
+    } while (seconds_since(start) < seconds);
   });
-  return fastest;
+  return std::accumulate(best.begin(), best.end(), 0.0);
 }
 
 }  // namespace rf3dgs

@@ -22,8 +22,9 @@ const FloorKernels& avx512_floor();
 // threads of each one's best slice. Takes `seconds`.
 double multiply_add_rate(const FloorKernels& kernels, int threads, double seconds);
 
-// Bytes per second that `threads` together move when each goes through its share of `bytes`: the best of the rounds that
-// fit into `seconds`. Reading counts every byte once; changing counts it twice, read and written.
+// Bytes per second that `threads` together move, each going through its share of `bytes`: the sum over the threads of
+// each one's best pass, per second of its CPU time. Reading counts every byte once; changing counts it twice, read and
+// written. Takes `seconds`.
 enum class Traffic { read, change };
 double bandwidth(const FloorKernels& kernels, Traffic traffic, int threads, size_t bytes, double seconds);
 

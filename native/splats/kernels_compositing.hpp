@@ -50,67 +50,69 @@ RF_INLINE void each_block(const Finishing& how, size_t count, Work work) {
 }
 
 // All ones in the lanes whose channel is in the window.
-RF_INLINE void window_lanes(const Finishing& how, float (*to)[kLanes]) {
+RF_INLINE void window_lanes(const Finishing& how, float* to) {
   for (int at = 0; at < kLanes * how.channels; ++at) {
-    to[at / kLanes][at % kLanes] = how.in_window != nullptr && how.in_window[at % how.channels] ? 1.0f : 0.0f;
+    to[at] = how.in_window != nullptr && how.in_window[at % how.channels] ? 1.0f : 0.0f;
   }
 }
 
 void finish(const Finishing& how, size_t count, const float* raw, const float* weight, const float* added, float* out) {
-  alignas(64) float window[kMostFinished][kLanes], value[kMostFinished][kLanes], other[kMostFinished][kLanes];
+  alignas(64) float window[kMostFinished * kLanes], value[kMostFinished * kLanes], other[kMostFinished * kLanes];
+  const int lanes = kLanes * how.channels;
   window_lanes(how, window);
   each_block(how, count, [&](const PixelBlock& block, size_t first) {
     const size_t at = first * how.channels;
-    block.read(raw + at, value[0]);
+    block.read(raw + at, value);
     if (how.normalise) {
-      block.inverse_weights(weight + first, other[0]);
-      for (int c = 0; c < how.channels; ++c) store(value[c], load(value[c]) * load(other[c]));
+      block.inverse_weights(weight + first, other);
+      for (int lane = 0; lane < lanes; lane += kLanes) store(value + lane, load(value + lane) * load(other + lane));
     }
     if (added != nullptr) {
-      block.read(added + at, other[0]);
-      for (int c = 0; c < how.channels; ++c) store(value[c], load(value[c]) + load(other[c]));
+      block.read(added + at, other);
+      for (int lane = 0; lane < lanes; lane += kLanes) store(value + lane, load(value + lane) + load(other + lane));
     }
     if (how.in_window != nullptr) {
-      for (int c = 0; c < how.channels; ++c) {
-        const Vec v = load(value[c]), power = 1.0f + select(v < 0.0f, Vec{}, v) * how.inverse_floor;
+      for (int lane = 0; lane < lanes; lane += kLanes) {
+        const Vec v = load(value + lane), power = 1.0f + select(v < 0.0f, Vec{}, v) * how.inverse_floor;
         const Vec level = how.gain * log_vec(power) + (power - power);  // what is not finite stays so
-        store(value[c], select(load(window[c]) > 0.0f, level, v));
+        store(value + lane, select(load(window + lane) > 0.0f, level, v));
       }
     }
-    std::memcpy(out + at, value[0], block.floats * sizeof(float));
+    std::memcpy(out + at, value, block.floats * sizeof(float));
   });
 }
 
 void finish_backward(const Finishing& how, size_t count, const float* raw, const float* weight, const float* added,
                      const float* gradient, float* raw_gradient, float* weight_gradient) {
-  alignas(64) float window[kMostFinished][kLanes], value[kMostFinished][kLanes], other[kMostFinished][kLanes];
-  alignas(64) float inverse[kMostFinished][kLanes], of[kMostFinished][kLanes];
+  alignas(64) float window[kMostFinished * kLanes], value[kMostFinished * kLanes], other[kMostFinished * kLanes];
+  alignas(64) float inverse[kMostFinished * kLanes], of[kMostFinished * kLanes];
+  const int lanes = kLanes * how.channels;
   window_lanes(how, window);
   each_block(how, count, [&](const PixelBlock& block, size_t first) {
     const size_t at = first * how.channels;
-    block.read(gradient + at, of[0]);
-    block.read(raw + at, value[0]);
+    block.read(gradient + at, of);
+    block.read(raw + at, value);
     if (how.normalise) {
-      block.inverse_weights(weight + first, inverse[0]);
-      for (int c = 0; c < how.channels; ++c) store(value[c], load(value[c]) * load(inverse[c]));
+      block.inverse_weights(weight + first, inverse);
+      for (int lane = 0; lane < lanes; lane += kLanes) store(value + lane, load(value + lane) * load(inverse + lane));
     }
     if (how.in_window != nullptr) {
-      if (added != nullptr) block.read(added + at, other[0]);
-      for (int c = 0; c < how.channels; ++c) {
-        const Vec v = added == nullptr ? load(value[c]) : load(value[c]) + load(other[c]);
+      if (added != nullptr) block.read(added + at, other);
+      for (int lane = 0; lane < lanes; lane += kLanes) {
+        const Vec v = added == nullptr ? load(value + lane) : load(value + lane) + load(other + lane);
         const Vec slope = select(v < 0.0f, Vec{}, how.gain * how.inverse_floor / (1.0f + v * how.inverse_floor));
-        store(of[c], load(of[c]) * select(load(window[c]) > 0.0f, slope, splat_vec(1.0f)));
+        store(of + lane, load(of + lane) * select(load(window + lane) > 0.0f, slope, splat_vec(1.0f)));
       }
     }
     if (how.normalise) {
-      for (int c = 0; c < how.channels; ++c) store(of[c], load(of[c]) * load(inverse[c]));
+      for (int lane = 0; lane < lanes; lane += kLanes) store(of + lane, load(of + lane) * load(inverse + lane));
       for (int pixel = 0; pixel < block.pixels; ++pixel) {
         float sum = 0.0f;
-        for (int lane = pixel * how.channels; lane < (pixel + 1) * how.channels; ++lane) sum += of[0][lane] * value[0][lane];
+        for (int lane = pixel * how.channels; lane < (pixel + 1) * how.channels; ++lane) sum += of[lane] * value[lane];
         weight_gradient[first + pixel] -= sum;
       }
     }
-    std::memcpy(raw_gradient + at, of[0], block.floats * sizeof(float));
+    std::memcpy(raw_gradient + at, of, block.floats * sizeof(float));
   });
 }
 

@@ -19,7 +19,7 @@ _CURVES = (
     ("delay_ns", "Delay error [ns]", "linear"),
     ("departure_deg", "Departure error [deg]", "linear"),
 )
-_STYLE: dict[Any, Any] = {
+STYLE: dict[Any, Any] = {
     **{"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True},
     **{"grid.color": "#e4e7eb", "axes.edgecolor": "#8a9099", "axes.axisbelow": True, "legend.frameon": False},
 }
@@ -30,7 +30,7 @@ def distributions(evaluation: Evaluation) -> bytes:
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.6, 5.4), dpi=150, layout="constrained")
         axes = figure.subplots(2, 3).ravel()
         for axis, (column, label, scale) in zip(axes, _CURVES, strict=True):
@@ -75,7 +75,7 @@ def position_map(
     from matplotlib.colors import LinearSegmentedColormap, Normalize
     from matplotlib.figure import Figure
 
-    with mpl.rc_context({**_STYLE, "axes.grid": False}):
+    with mpl.rc_context({**STYLE, "axes.grid": False}):
         span = np.ptp(positions[:, :2], axis=0).max(initial=1.0) if len(positions) else 1.0
         figure = Figure(figsize=(7.6, 6.6), dpi=150, layout="constrained")
         axis = figure.add_subplot()
