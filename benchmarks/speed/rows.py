@@ -35,6 +35,7 @@ ROWS = (
     Row("frozen step 1 ch, 100k", lambda: training(room(100_000, channels=1)), ratios=(2.1, 1.3)),
     Row("radio stage step RGB, 100k", lambda: training(room(100_000), views=RADIO_VIEWS), zen5_ms=(4.0, 2.5), run=True),
     Row("full step RGB, 100k", lambda: training(room(100_000), frozen=False), zen5_ms=(11.0, 5.0)),
+    Row("sphere 360x180 1 ch, 100k", lambda: rendering(room(100_000, channels=1), sphere=True), zen5_ms=(5.0, 3.0)),
     Row("1M merged: render 1 ch", lambda: rendering(merged_room()), zen5_ms=(8.0, 5.0)),
     Row("1M merged: frozen step 1 ch", lambda: training(merged_room()), zen5_ms=(20.0, 10.0)),
 )
