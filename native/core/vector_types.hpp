@@ -37,7 +37,6 @@ constexpr int kParts = 4;
 #endif
 typedef float FloatPart __attribute__((vector_size(64 / kParts)));
 typedef int32_t IntPart __attribute__((vector_size(64 / kParts)));
-typedef uint32_t WrappingPart __attribute__((vector_size(64 / kParts)));
 
 struct Vec {
   FloatPart part[kParts];
@@ -88,22 +87,12 @@ RF_INLINE Vec& operator*=(Vec& a, const Vec& b) { return a = a * b; }
   }
 RF_BINARY(&)
 RF_BINARY(|)
+RF_BINARY(+)
+RF_BINARY(-)
 RF_BINARY(<<)
 RF_BINARY(<)
 RF_BINARY(<=)
 #undef RF_BINARY
-
-// Lanes that nobody looks at may hold anything: sums wrap.
-RF_INLINE IntVec operator+(const IntVec& a, const IntVec& b) {
-  IntVec result;
-  RF_EACH_PART result.part[at] = (IntPart)((WrappingPart)a.part[at] + (WrappingPart)b.part[at]);
-  return result;
-}
-RF_INLINE IntVec operator-(const IntVec& a, const IntVec& b) {
-  IntVec result;
-  RF_EACH_PART result.part[at] = (IntPart)((WrappingPart)a.part[at] - (WrappingPart)b.part[at]);
-  return result;
-}
 
 RF_INLINE IntVec& operator&=(IntVec& a, const IntVec& b) { return a = a & b; }
 RF_INLINE IntVec operator&(const IntVec& a, int32_t b) {
@@ -113,7 +102,7 @@ RF_INLINE IntVec operator&(const IntVec& a, int32_t b) {
 }
 RF_INLINE IntVec operator+(const IntVec& a, int32_t b) {
   IntVec result;
-  RF_EACH_PART result.part[at] = (IntPart)((WrappingPart)a.part[at] + static_cast<uint32_t>(b));
+  RF_EACH_PART result.part[at] = a.part[at] + b;
   return result;
 }
 RF_INLINE IntVec operator!=(const IntVec& a, int32_t b) {
