@@ -97,9 +97,7 @@ PRESETS = {
         lr_opacity=5e-2,
         lr_csi=5.6e-3,
     ),
-    "best": RadioConfig(
-        steps=2_000, ridge=3.0, lr_level=3e-4, lr_harmonics=6e-5, lr_opacity=1.5e-3, ssim_weight=0.0
-    ),
+    "best": RadioConfig(steps=2_000, ridge=3.0, lr_level=3e-4, lr_harmonics=6e-5, lr_opacity=1.5e-3, ssim_weight=0.0),
 }
 
 
