@@ -55,7 +55,7 @@ class Drawing:
         found = [torch.zeros_like(tensor) for tensor in (values, opacities, means, quats, scales)]
         found.append(torch.zeros(len(means), 2))
         arguments = (means, quats, scales, opacities, None, self.picture, self.weight, of_picture, of_weight)
-        self.core.rasterize_backward(self.scene, *arguments, *found, self.threads)
+        self.core.rasterize_backward(self.scene, *arguments, *found, None, self.threads)
         return found
 
 
