@@ -16,6 +16,7 @@ from rf3dgs.core.grids import DirectionGrid
 from rf3dgs.core.progress import Progress
 from rf3dgs.data.dataset import Dataset, Part
 from rf3dgs.data.photo import Photo
+from rf3dgs.data.split import every_kth
 from rf3dgs.evaluation.protocol import evaluate
 from rf3dgs.evaluation.report import PhotoPair, ReportInputs, SpectrumExample
 from rf3dgs.evaluation.table import Evaluation
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from rf3dgs.field.radio_field import RadioField
     from rf3dgs.propagation.scene import Scene
 
+HOLD_OUT_EVERY = 7
+"""Every seventh photograph of a tour is held out: its neighbours on the walk are not."""
 REPEAT_SEED = 100_003
 REPEAT_RAYS = 5 / 3  # the second solve shoots this many times the rays: a lattice of its own
 
@@ -49,18 +52,23 @@ def spectra_of_scene(
 def photograph(
     scene: "Scene", count: int, seed: int, config: PhotoConfig, folder: Path, progress: Progress
 ) -> list[Photo]:
-    """Render a tour of the scene into JPEG files in `folder`."""
+    """Render a tour of the scene into `folder`: JPEG files, and PNG for those that `HOLD_OUT_EVERY` holds out."""
     from PIL import Image
 
     from rf3dgs.propagation.photographer import camera_tour, render_photos
 
     cameras = camera_tour(scene, count, seed, config)
-    photos = []
-    for number, picture in enumerate(render_photos(scene, cameras, config, progress)):
-        name = f"{number:05d}.jpg"
-        Image.fromarray(picture).save(folder / name, quality=92)
-        photos.append(Photo(name, cameras[number], folder / name))
-    return photos
+    held_out = [role == "test" for role in every_kth(count, HOLD_OUT_EVERY)]
+    clean = replace(config, samples=config.held_out_samples or config.samples, seed=config.seed + count)
+    photos: dict[int, Photo] = {}
+    for judge, how in ((True, clean), (False, config)):
+        numbers = [number for number in range(count) if held_out[number] == judge]
+        pictures = render_photos(scene, [cameras[number] for number in numbers], how, progress)
+        for number, picture in zip(numbers, pictures, strict=True):
+            name = f"{number:05d}.{'png' if judge else 'jpg'}"
+            Image.fromarray(picture).save(folder / name, **({} if judge else {"quality": 95, "subsampling": 0}))
+            photos[number] = Photo(name, cameras[number], folder / name)
+    return [photos[number] for number in range(count)]
 
 
 def make_dataset(
@@ -93,8 +101,7 @@ def make_dataset(
     with tempfile.TemporaryDirectory(dir=folder.parent) as temporary:
         pictures = photograph(scene, photos, seed, photo, Path(temporary), progress) if photos else []
         whole = Dataset(pictures, spectra, repeat=repeat, repeat_index=index, meta=meta)
-        # The tour's pitches repeat every eight photographs, so every seventh is held out.
-        return whole.split(seed=seed, photo_test_every=7).save(folder)
+        return whole.split(seed=seed, photo_test_every=HOLD_OUT_EVERY).save(folder)
 
 
 def geometry_of_mesh(scene: "Scene", count: int, seed: int) -> Gaussians:

@@ -42,7 +42,7 @@ class Demo:
     photo_config: PhotoConfig = field(default_factory=PhotoConfig)
     """How photographs are rendered."""
     visual: VisualConfig = field(
-        default_factory=lambda: VisualConfig(steps=3000, max_count=40_000, ssim_weight=0.05, degree=1)
+        default_factory=lambda: VisualConfig(steps=3000, max_count=50_000, ssim_weight=0.05, degree=1)
     )
     """The visual stage."""
     preset: Preset | None = None

@@ -40,7 +40,9 @@ class PhotoConfig:
     fov_deg: float = 85.0
     """Horizontal field of view [deg]."""
     samples: int = 64
-    """Light paths per pixel; noise falls with the square root."""
+    """Light paths per pixel, rounded up to a square number; noise falls with the square root."""
+    held_out_samples: int | None = None
+    """The same for held-out photographs, which judge the others; None takes `samples`."""
     bounces: int = 6
     """Largest number of segments of a light path."""
     exposure: float = 1.0

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from rf3dgs.core.errors import InputError, MissingDependencyError
 from rf3dgs.core.frames import Pose, mitsuba_from_viewmat
@@ -18,36 +19,55 @@ from rf3dgs.propagation.llvm import find_llvm, mitsuba_variant, prepare
 from rf3dgs.propagation.scene import Scene
 from rf3dgs.propagation.scene_files import srgb_from_linear, write_visual_scene
 
-PITCH_DEG = (-8.0, 12.0, -30.0, 0.0, 38.0, -15.0, 22.0, -48.0)
-"""Pitches the tour cycles through [deg], upwards positive: walls mostly, floor and ceiling often."""
+REACH = 0.8
+"""How far the walk goes towards the edge of `camera_bounds`, as a share of half its size."""
+SWAY = 0.3
+"""How far camera heights swing about the middle of `camera_bounds`, as a share of half its height."""
+PITCH_DEG, NOD_DEG = -3.0, 7.0
+"""Mean pitch of the cameras, upwards positive, and how far it swings about it."""
+SWAYS, NODS = 7, 5
+"""Swings of height and of pitch in one round."""
+CLEARANCE = 0.45
+"""Distance of the cameras from every surface [m]."""
 
 
 def camera_tour(scene: Scene, count: int, seed: int, config: PhotoConfig | None = None) -> list[Camera]:
-    """`count` cameras spread over the free space of `camera_bounds`, which together see walls, floor and ceiling.
+    """`count` cameras of one walk round the middle of `camera_bounds`, in equal steps, all looking across it.
 
-    Each position is the candidate farthest from those before it; yaws follow the golden angle, then of four turns the
-    one with the longest free view ahead is taken.
+    The walk is a rounded rectangle; height and pitch swing slowly, so that neighbours see nearly the same from places
+    a step apart, and every wall is seen from the far side. Where something stands in the way the camera steps towards
+    the middle, or, when all of that is blocked, to the nearest of many free places drawn with `seed`.
     """
     config = PhotoConfig() if config is None else config
     grid = pinhole_grid(config.width, config.height, config.fov_deg)
-    pool = scene.free_points(scene.camera_bounds, 12 * count, seed, clearance=0.45)
-    chosen = [0]
-    nearest = (pool - pool[0]).norm(dim=-1)
-    while len(chosen) < count:
-        index = int(nearest.argmax())
-        chosen.append(index)
-        nearest = torch.minimum(nearest, (pool - pool[index]).norm(dim=-1))
-    cameras = []
-    steps = torch.linspace(0.5, 6.0, 12)
-    for number, position in enumerate(pool[chosen]):
-        pitch = math.radians(PITCH_DEG[number % len(PITCH_DEG)])
-        yaws = number * math.pi * (3 - math.sqrt(5)) + torch.arange(4) * (math.pi / 2)
-        level = torch.stack((torch.cos(yaws), torch.sin(yaws), torch.zeros(4)), -1)
-        open_ahead = scene.free(position + level[:, None] * steps[None, :, None], 0.1).int()
-        yaw = float(yaws[int(open_ahead.cumprod(-1).sum(-1).argmax())])
-        forward = torch.tensor([math.cos(yaw), math.sin(yaw), math.tan(pitch)])
-        cameras.append(Camera.of(Pose.look_at(position, position + forward), grid))
-    return cameras
+    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in scene.camera_bounds)
+    middle, half = (low + high) / 2, (high - low) / 2
+    around = _rounded_rectangle(count) * REACH * half[:2]
+    part = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
+    height = SWAY * half[2] * torch.sin(SWAYS * part)
+    pitch = torch.deg2rad(PITCH_DEG + NOD_DEG * torch.sin(NODS * part))
+    nearer = torch.linspace(1.0, 0.3, 36, dtype=torch.float64)[:, None, None]
+    level = torch.cat((nearer * around, height[:, None].expand(len(nearer), -1, 1)), -1)
+    places = (middle + level).float()
+    free = scene.free(places, CLEARANCE)
+    place = places[free.int().argmax(0), torch.arange(count)]
+    blocked = ~free.any(0)
+    if bool(blocked.any()):
+        pool = scene.free_points(scene.camera_bounds, 4000, seed, clearance=CLEARANCE)
+        place = torch.where(blocked[:, None], pool[torch.cdist(place, pool).argmin(-1)], place)
+    ahead = -torch.nn.functional.normalize(around, dim=-1)
+    forward = torch.cat((ahead, torch.tan(pitch)[:, None]), -1).float()
+    return [Camera.of(Pose.look_at(at, at + way), grid) for at, way in zip(place, forward, strict=True)]
+
+
+def _rounded_rectangle(count: int) -> Tensor:
+    """Points `[count, 2]` in equal steps along x^4 + y^4 = 1, from the x axis counter-clockwise."""
+    angle = torch.linspace(0.0, 2 * math.pi, 4001, dtype=torch.float64)
+    curve = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
+    curve = curve / curve.pow(4).sum(-1, keepdim=True) ** 0.25
+    length = torch.cat((curve.new_zeros(1), torch.linalg.vector_norm(curve[1:] - curve[:-1], dim=-1).cumsum(0)))
+    at = torch.arange(count, dtype=torch.float64) * (length[-1] / count)
+    return curve[torch.searchsorted(length, at)]
 
 
 def render_photos(
@@ -80,14 +100,15 @@ def render_photos(
 
 def _render(mitsuba, loaded, camera: Camera, config: PhotoConfig, seed: int) -> NDArray[np.float64]:
     """Linear light `[row, col, 3]` that one camera sees."""
-    sensor = mitsuba.load_dict(_sensor(mitsuba, camera))
+    samples = (math.isqrt(config.samples - 1) + 1) ** 2
+    sensor = mitsuba.load_dict(_sensor(mitsuba, camera, samples))
     integrator = mitsuba.load_dict({"type": "path", "max_depth": config.bounces, "rr_depth": 100})
-    picture = mitsuba.render(loaded, sensor=sensor, integrator=integrator, spp=config.samples, seed=seed)
+    picture = mitsuba.render(loaded, sensor=sensor, integrator=integrator, spp=samples, seed=seed)
     return np.array(picture, dtype=np.float64)[..., :3]
 
 
-def _sensor(mitsuba, camera: Camera) -> dict:
-    """Mitsuba's description of a pinhole camera."""
+def _sensor(mitsuba, camera: Camera, samples: int) -> dict:
+    """Mitsuba's description of a pinhole camera; `samples` light paths per pixel, a square number, are well spread."""
     focal_x, focal_y = float(camera.K[0, 0]), float(camera.K[1, 1])
     if abs(focal_x - focal_y) > 1e-3 * focal_x:
         raise InputError(f"photographs need square pixels; got focal lengths {focal_x:g} and {focal_y:g} pixels")
@@ -107,5 +128,5 @@ def _sensor(mitsuba, camera: Camera) -> dict:
             "pixel_format": "rgb",
             "rfilter": {"type": "box"},
         },
-        "sampler": {"type": "independent"},
+        "sampler": {"type": "multijitter", "sample_count": samples},
     }

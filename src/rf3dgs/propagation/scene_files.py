@@ -14,6 +14,7 @@ from rf3dgs.propagation.scene import Scene, SceneObject
 
 VERSION = "2.1.0"
 LARGEST_XML = 16 * 2**20  # bytes
+LEAST_SAMPLING = 0.2  # light paths that seek a faint light, as a share of those that seek the brightest
 
 
 def write_radio_scene(scene: Scene, folder: str | Path, *, frequency: float | None = None) -> Path:
@@ -59,6 +60,7 @@ def write_visual_scene(scene: Scene, folder: str | Path) -> Path:
         position = [f"{value:.4f}" for value in ((x0 + x1) / 2, (y0 + y1) / 2, z0 + 0.9 * (z1 - z0))]
         ET.SubElement(lamp, "point", {"name": "position", **dict(zip("xyz", position, strict=True))})
         _value(lamp, "rgb", "intensity", str(round(0.3 * scene.size**2, 4)))
+    brightest = max((item.glow for item in scene.objects), default=0.0)
     for item in scene.objects:
         shape = _shape(root, item, folder)
         outer = ET.SubElement(shape, "bsdf", type="twosided")
@@ -66,6 +68,7 @@ def write_visual_scene(scene: Scene, folder: str | Path) -> Path:
         if item.glow > 0:
             _value(bsdf, "rgb", "reflectance", "0.05")
             emitter = ET.SubElement(shape, "emitter", type="area")
+            _value(emitter, "float", "sampling_weight", round(max(item.glow / brightest, LEAST_SAMPLING), 4))
             _look(emitter, "radiance", item, folder)
         else:
             _look(bsdf, "reflectance", item, folder)

@@ -172,8 +172,8 @@ class VisualConfig:
     """Share of D-SSIM in the loss; the rest is L1."""
 
     depth_weight: float | None = None
-    """Weight of the relative error of the drawn depth against the sweep's; None: 0.5 for the shortest runs, falling to
-    the published method's 0 at 30,000 steps."""
+    """First weight of the relative error of the drawn depth against the sweep's, which falls to 0 while the population
+    grows; None: 0.5 for the shortest runs, less for longer ones, down to the published method's 0 at 30,000 steps."""
 
     backend: Literal["auto", "native", "reference", "gsplat"] = "auto"
     """Which rasterizer works."""

@@ -10,8 +10,8 @@ from torch import Tensor
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import Camera
 from rf3dgs.data.photo import Photo
+from rf3dgs.splats.draw import draw
 from rf3dgs.splats.gaussians import Gaussians
-from rf3dgs.splats.harmonics import view_values
 from rf3dgs.splats.rasterize import rasterize
 
 LONGEST = 3.0
@@ -20,10 +20,7 @@ BackendName = Literal["auto", "native", "reference", "gsplat"]
 
 def render_photo(gaussians: Gaussians, camera: Camera, *, backend: BackendName = "auto") -> Tensor:
     """The photograph `[row, col, 3]`, 0 to 1, that `camera` would take of the Gaussians, on black."""
-    with torch.no_grad():
-        colour = colour_towards(gaussians.sh[:, :1], gaussians.sh[:, 1:], gaussians.means, camera)
-        args = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, colour
-        return rasterize(*args, camera, backend=backend).values.clamp(0.0, 1.0)
+    return draw(gaussians, camera, backend=backend).values.clamp(0.0, 1.0)
 
 
 def blending_weights(gaussians: Gaussians, cameras: Sequence[Camera], *, backend: BackendName = "auto") -> Tensor:
@@ -34,16 +31,6 @@ def blending_weights(gaussians: Gaussians, cameras: Sequence[Camera], *, backend
     for camera in cameras:
         rasterize(*args, camera, backend=backend).values.sum().backward()
     return torch.zeros(len(gaussians)) if unit.grad is None else unit.grad[:, 0]
-
-
-def colour_towards(level: Tensor, bands: Tensor, means: Tensor, camera: Camera) -> Tensor:
-    """Colours `[gaussian, 3]` that `camera` sees: 3DGS's 0.5 + harmonics, not below 0.
-
-    `level` `[gaussian, 1, 3]` is the constant harmonic, `bands` `[gaussian, k - 1, 3]` the others. The direction to a
-    Gaussian counts as fixed: `means` get no gradient from here.
-    """
-    sh = torch.cat((level, bands), 1)
-    return view_values(sh, means.detach(), camera.position, offset=0.5, clamp=True)
 
 
 def picture_of(photo: Photo) -> Tensor:

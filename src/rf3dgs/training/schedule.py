@@ -62,6 +62,10 @@ class Schedule:
         """How many times smaller than the photograph the picture of an iteration is: 4, 2 or 1."""
         return 4 if iteration < self.double_at[0] else 2 if iteration < self.double_at[1] else 1
 
+    def depth_weight_at(self, iteration: int) -> float:
+        """The weight of the sweep's depth in an iteration: it falls to zero while the population grows."""
+        return self.depth_weight * max(0.0, 1 - iteration / max(1, self.densify_until))
+
     def degree_at(self, iteration: int) -> int:
         """The degree of the colour's harmonics in an iteration."""
         return min(self.degree, iteration // self.degree_every)

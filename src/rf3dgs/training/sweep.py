@@ -1,11 +1,11 @@
 """Surfaces out of posed photographs by plane sweep: a better place to begin than random Gaussians.
 
-A small copy of each photograph is compared with its neighbours on trial planes (normalised cross-correlation of
-windows), in three rounds: planes that face the camera, in even steps of inverse depth; planes along the normals of the
-large planes found so far, on which floors and ceilings seen at a flat angle match as well; and those large planes
-themselves, which fill what is left between clear pixels. A depth counts where the depth map of another photograph
-confirms it. Collins (1996), "A space-sweep approach to true multi-image matching"; Gallup et al. (2007), "Real-time
-plane-sweeping stereo with multiple sweeping directions".
+A small copy of each photograph is compared with others from some way off on trial planes (normalised
+cross-correlation of windows), in three rounds: planes that face the camera, in even steps of inverse depth; planes
+along the normals of the large planes found so far, on which floors and ceilings seen at a flat angle match as well;
+and those large planes themselves, which fill what is left between clear pixels. A depth counts where the depth map of
+another photograph confirms it. Collins (1996), "A space-sweep approach to true multi-image matching"; Gallup et al.
+(2007), "Real-time plane-sweeping stereo with multiple sweeping directions".
 """
 
 from collections.abc import Sequence
@@ -19,11 +19,12 @@ from rf3dgs.core.grids import Camera
 from rf3dgs.training.photographs import shrunk
 from rf3dgs.training.planes import Planes, directions_of, find_planes
 
-PIXELS_ACROSS = 80
+PIXELS_ACROSS = 107
 DEPTHS = 80
 FINER = 4
 NEAREST = 0.04
 NEIGHBOURS = 4
+BASELINE = 0.08
 WINDOW = 7
 CORRELATION = 0.7
 LEAST_CONTRAST = 0.012
@@ -187,7 +188,10 @@ def _fill(view: View, partners: Sequence[View], planes: Planes, sure: Tensor, fa
 
 
 def _partners(views: Sequence[View], index: int, far: float) -> list[int]:
-    """The views that share most with view `index`, counted over a coarse grid of depths, not from the same place."""
+    """The views that share most with view `index`, counted over a coarse grid of depths, from `BASELINE` of `far` away.
+
+    Nearer ones show depth less: they count by the square of their distance.
+    """
     own = views[index].camera
     probe = View(own.resized(12, 9), torch.zeros(9, 12, 3))
     depths = [torch.full((9, 12), share * far) for share in (0.1, 0.2, 0.35, 0.6)]
@@ -197,7 +201,8 @@ def _partners(views: Sequence[View], index: int, far: float) -> list[int]:
         moved = float(torch.linalg.vector_norm(view.camera.position - own.position))
         facing = float(view.camera.viewmat[2, :3] @ own.viewmat[2, :3])
         inside = project(view.camera, points)[1].float().mean()
-        scores.append(float(inside) if other != index and moved > 0.01 * far and facing > 0.3 else 0.0)
+        apart = min(1.0, moved / (BASELINE * far)) ** 2
+        scores.append(apart * float(inside) if other != index and facing > 0.3 else 0.0)
     order = sorted(range(len(views)), key=lambda other: -scores[other])[:NEIGHBOURS]
     return [other for other in order if scores[other] > 0.05]
 
