@@ -7,10 +7,10 @@ from rf3dgs.core.files import write_whole
 from rf3dgs.evaluation.figures import STYLE
 
 AXES = {
-    "gaussians": ("Gaussians", "cpu_ms", "log"),
-    "pixels": ("pixels", "cpu_ms", "log"),
-    "channels": ("channels", "cpu_ms", "linear"),
-    "threads": ("threads", "wall_ms", "linear"),
+    "gaussians": ("thousand Gaussians", 1e-3, "cpu_ms"),
+    "pixels": ("thousand pixels", 1e-3, "cpu_ms"),
+    "channels": ("channels", 1, "cpu_ms"),
+    "threads": ("threads", 1, "wall_ms"),
 }
 COLOURS = {"render": "#0b6e99", "frozen step": "#d9822b"}
 
@@ -24,18 +24,15 @@ def draw_scaling(result: dict, folder: Path) -> None:
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.6, 6.4), dpi=150, layout="constrained")
         FigureCanvasAgg(figure)
-        for axis, (name, (label, cost, scale)) in zip(figure.subplots(2, 2).ravel(), AXES.items(), strict=True):
+        for axis, (name, (label, unit, cost)) in zip(figure.subplots(2, 2).ravel(), AXES.items(), strict=True):
             for kind, found in result[name].items():
-                at = [point["at"] for point in found["points"]]
+                at = [unit * point["at"] for point in found["points"]]
                 axis.plot(at, [point[cost] for point in found["points"]], "o-", color=COLOURS[kind], label=kind)
                 if cost == "cpu_ms":
                     floor = [point["floor_ms"] for point in found["points"]]
                     axis.plot(at, floor, "--", color=COLOURS[kind], label=f"{kind}, floor")
-            axis.set_xscale(scale)
-            axis.set_yscale(scale)
-            if scale == "linear":
-                axis.set_ylim(bottom=0)
-                axis.set_xticks(at)
+            axis.set_ylim(bottom=0)
+            axis.set_xticks(at[-3:] if unit < 1 else at)
             axis.set_xlabel(label)
             axis.set_ylabel("CPU time of all threads [ms]" if cost == "cpu_ms" else "time of the clock [ms]")
         axis = figure.axes[0]
