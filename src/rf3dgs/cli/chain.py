@@ -66,7 +66,7 @@ def photograph(
         pictures = render_photos(scene, [cameras[number] for number in numbers], how, progress)
         for number, picture in zip(numbers, pictures, strict=True):
             name = f"{number:05d}.{'png' if judge else 'jpg'}"
-            Image.fromarray(picture).save(folder / name, **({} if judge else {"quality": 95, "subsampling": 0}))
+            Image.fromarray(picture).save(folder / name, quality=95, subsampling=0)  # PNG has neither
             photos[number] = Photo(name, cameras[number], folder / name)
     return [photos[number] for number in range(count)]
 

@@ -99,7 +99,8 @@ class VisualStage:
         start = self._start(self.initial)
         missing = coefficient_count(self.config.degree) - start.sh.shape[1]
         sh = torch.nn.functional.pad(start.sh, (0, 0, 0, missing))
-        trainer = Trainer(**(start.tensors() | {"sh": sh}), train=TRAINED, backend=self.config.backend)
+        shape = start.means, start.quats, start.log_scales, start.logit_opacities
+        trainer = Trainer(*shape, sh, train=TRAINED, backend=self.config.backend)
         trainer.degree = self.first_degree
         self.trainer = trainer
         return trainer
