@@ -52,7 +52,7 @@ def spectra_of_scene(
 def photograph(
     scene: "Scene", count: int, seed: int, config: PhotoConfig, folder: Path, progress: Progress
 ) -> list[Photo]:
-    """Render a tour of the scene into `folder`: JPEG files, and PNG for those that `HOLD_OUT_EVERY` holds out."""
+    """Render a tour of the scene into JPEG files in `folder`; what is held out may have more light paths a pixel."""
     from PIL import Image
 
     from rf3dgs.propagation.photographer import camera_tour, render_photos
@@ -65,8 +65,8 @@ def photograph(
         numbers = [number for number in range(count) if held_out[number] == judge]
         pictures = render_photos(scene, [cameras[number] for number in numbers], how, progress)
         for number, picture in zip(numbers, pictures, strict=True):
-            name = f"{number:05d}.{'png' if judge else 'jpg'}"
-            Image.fromarray(picture).save(folder / name, quality=95, subsampling=0)  # PNG has neither
+            name = f"{number:05d}.jpg"
+            Image.fromarray(picture).save(folder / name, quality=95, subsampling=0)
             photos[number] = Photo(name, cameras[number], folder / name)
     return [photos[number] for number in range(count)]
 
