@@ -1,6 +1,6 @@
 """Puts the table of a run into the documentation.
 
-    python -m benchmarks.speed.page out/bench docs/performance.md
+python -m benchmarks.speed.page out/bench docs/performance.md
 """
 
 import argparse
