@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from rf3dgs.propagation.llvm import find_llvm as find_llvm
     from rf3dgs.propagation.photographer import camera_tour as camera_tour
     from rf3dgs.propagation.photographer import render_photos as render_photos
+    from rf3dgs.propagation.room import Slab as Slab
+    from rf3dgs.propagation.room import shoebox as shoebox
     from rf3dgs.propagation.scene import Scene as Scene
     from rf3dgs.propagation.scene import SceneObject as SceneObject
     from rf3dgs.propagation.scene_files import write_radio_scene as write_radio_scene
@@ -25,6 +27,8 @@ _HOMES = {
     "write_visual_scene": ".scene_files",
     "TraceConfig": ".config",
     "sionna": ".sionna",
+    "shoebox": ".room",
+    "Slab": ".room",
     "PhotoConfig": ".config",
     "camera_tour": ".photographer",
     "render_photos": ".photographer",
@@ -38,6 +42,8 @@ __all__ = [  # noqa: RUF022 (reading order)
     "write_visual_scene",
     "TraceConfig",
     "sionna",
+    "shoebox",
+    "Slab",
     "PhotoConfig",
     "camera_tour",
     "render_photos",
