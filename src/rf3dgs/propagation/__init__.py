@@ -8,6 +8,9 @@ if TYPE_CHECKING:
     from rf3dgs.propagation import sionna as sionna
     from rf3dgs.propagation.config import PhotoConfig as PhotoConfig
     from rf3dgs.propagation.config import TraceConfig as TraceConfig
+    from rf3dgs.propagation.deepmimo import deepmimo_pairs as deepmimo_pairs
+    from rf3dgs.propagation.deepmimo import read_deepmimo as read_deepmimo
+    from rf3dgs.propagation.deepmimo_write import write_deepmimo as write_deepmimo
     from rf3dgs.propagation.llvm import find_llvm as find_llvm
     from rf3dgs.propagation.photographer import camera_tour as camera_tour
     from rf3dgs.propagation.photographer import render_photos as render_photos
@@ -29,6 +32,9 @@ _HOMES = {
     "sionna": ".sionna",
     "shoebox": ".room",
     "Slab": ".room",
+    "read_deepmimo": ".deepmimo",
+    "deepmimo_pairs": ".deepmimo",
+    "write_deepmimo": ".deepmimo_write",
     "PhotoConfig": ".config",
     "camera_tour": ".photographer",
     "render_photos": ".photographer",
@@ -44,6 +50,9 @@ __all__ = [  # noqa: RUF022 (reading order)
     "sionna",
     "shoebox",
     "Slab",
+    "read_deepmimo",
+    "deepmimo_pairs",
+    "write_deepmimo",
     "PhotoConfig",
     "camera_tour",
     "render_photos",
