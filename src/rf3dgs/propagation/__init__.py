@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from rf3dgs.propagation.deepmimo import read_deepmimo as read_deepmimo
     from rf3dgs.propagation.deepmimo_write import write_deepmimo as write_deepmimo
     from rf3dgs.propagation.llvm import find_llvm as find_llvm
+    from rf3dgs.propagation.matlab import write_mat as write_mat
+    from rf3dgs.propagation.matlab import write_matlab as write_matlab
     from rf3dgs.propagation.photographer import camera_tour as camera_tour
     from rf3dgs.propagation.photographer import render_photos as render_photos
     from rf3dgs.propagation.room import Slab as Slab
@@ -35,6 +37,8 @@ _HOMES = {
     "read_deepmimo": ".deepmimo",
     "deepmimo_pairs": ".deepmimo",
     "write_deepmimo": ".deepmimo_write",
+    "write_matlab": ".matlab",
+    "write_mat": ".matlab",
     "PhotoConfig": ".config",
     "camera_tour": ".photographer",
     "render_photos": ".photographer",
@@ -53,6 +57,8 @@ __all__ = [  # noqa: RUF022 (reading order)
     "read_deepmimo",
     "deepmimo_pairs",
     "write_deepmimo",
+    "write_matlab",
+    "write_mat",
     "PhotoConfig",
     "camera_tour",
     "render_photos",
