@@ -13,6 +13,7 @@ from rf3dgs import __version__
 from rf3dgs.cli.ask import Csi, Render, View
 from rf3dgs.cli.check import Doctor, Info, Validate
 from rf3dgs.cli.demo import Demo
+from rf3dgs.cli.exchange import Export, Import
 from rf3dgs.cli.fit import Fit, FitGeometry, FitRadio
 from rf3dgs.cli.judge import Eval
 from rf3dgs.cli.make import MakePhotos, MakeSpectra, Trace
@@ -25,6 +26,8 @@ Command = (
     | Annotated[Trace, name("trace")]
     | Annotated[MakePhotos, name("photos")]
     | Annotated[MakeSpectra, name("spectra")]
+    | Annotated[Import, name("import")]
+    | Annotated[Export, name("export")]
     | Annotated[Fit, name("fit")]
     | Annotated[FitGeometry, name("fit-geometry")]
     | Annotated[FitRadio, name("fit-radio")]
