@@ -45,8 +45,8 @@ class Sounding:
     delay_offset: bool = False
 
     def __post_init__(self) -> None:
-        response = torch.as_tensor(self.response).to(torch.complex128)
-        offsets = torch.as_tensor(self.offsets).double()
+        response = torch.as_tensor(self.response, dtype=torch.complex128)
+        offsets = torch.as_tensor(self.offsets, dtype=torch.float64)
         object.__setattr__(self, "response", response)
         object.__setattr__(self, "offsets", offsets)
         if not self.frequency > 0:
@@ -70,7 +70,7 @@ class Sounding:
             if not 0 < getattr(self, name) <= math.pi + 1e-9:
                 raise InputError(f"{name} must be an angle in radians, above 0 and up to pi; got {getattr(self, name)}")
         if self.noise_power is not None:
-            noise = torch.as_tensor(self.noise_power).double()
+            noise = torch.as_tensor(self.noise_power, dtype=torch.float64)
             if noise.dim() > len(batch) or not bool((torch.isfinite(noise) & (noise >= 0)).all()):
                 raise InputError(f"noise_power must be {list(batch)} powers of at least 0, or None; got {noise}")
             object.__setattr__(self, "noise_power", noise.expand(batch).clone())
@@ -107,7 +107,7 @@ class Sounding:
         """
         if not 0 < delay_step < 1:
             raise InputError(f"delay_step must be a positive time in seconds; got {delay_step}")
-        taps = torch.as_tensor(taps).to(torch.complex128)
+        taps = torch.as_tensor(taps, dtype=torch.complex128)
         count = taps.shape[-1]
         offsets = (torch.arange(count, dtype=torch.float64) - count // 2) / (delay_step * count)
         response = torch.fft.fftshift(torch.fft.fft(taps, dim=-1), dim=-1)
