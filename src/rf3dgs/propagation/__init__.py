@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from rf3dgs.propagation.llvm import find_llvm as find_llvm
     from rf3dgs.propagation.matlab import write_mat as write_mat
     from rf3dgs.propagation.matlab import write_matlab as write_matlab
+    from rf3dgs.propagation.measured import read_sounding as read_sounding
+    from rf3dgs.propagation.measured import write_sounding as write_sounding
     from rf3dgs.propagation.photographer import camera_tour as camera_tour
     from rf3dgs.propagation.photographer import render_photos as render_photos
     from rf3dgs.propagation.room import Slab as Slab
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
     from rf3dgs.propagation.scene_files import write_radio_scene as write_radio_scene
     from rf3dgs.propagation.scene_files import write_visual_scene as write_visual_scene
     from rf3dgs.propagation.scenes import scene_of as scene_of
+    from rf3dgs.propagation.sounder import Sounder as Sounder
+    from rf3dgs.propagation.sounder import sound as sound
 
 _HOMES = {
     "Scene": ".scene",
@@ -42,6 +46,10 @@ _HOMES = {
     "PhotoConfig": ".config",
     "camera_tour": ".photographer",
     "render_photos": ".photographer",
+    "Sounder": ".sounder",
+    "sound": ".sounder",
+    "read_sounding": ".measured",
+    "write_sounding": ".measured",
     "find_llvm": ".llvm",
 }
 __all__ = [  # noqa: RUF022 (reading order)
@@ -62,6 +70,10 @@ __all__ = [  # noqa: RUF022 (reading order)
     "PhotoConfig",
     "camera_tour",
     "render_photos",
+    "Sounder",
+    "sound",
+    "read_sounding",
+    "write_sounding",
     "find_llvm",
 ]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

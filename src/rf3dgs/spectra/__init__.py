@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from rf3dgs.core.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from rf3dgs.spectra import sage as sage
     from rf3dgs.spectra.beamformers import bartlett as bartlett
     from rf3dgs.spectra.beamformers import capon as capon
     from rf3dgs.spectra.beamformers import hann_taper as hann_taper
@@ -14,9 +15,13 @@ if TYPE_CHECKING:
     from rf3dgs.spectra.codec import window_of as window_of
     from rf3dgs.spectra.covariance import covariance_of as covariance_of
     from rf3dgs.spectra.covariance import covariance_of_spectrum as covariance_of_spectrum
+    from rf3dgs.spectra.crb import Bound as Bound
+    from rf3dgs.spectra.crb import cramer_rao as cramer_rao
     from rf3dgs.spectra.peaks import find_peaks as find_peaks
     from rf3dgs.spectra.peaks import main_peak as main_peak
     from rf3dgs.spectra.resampling import resample as resample
+    from rf3dgs.spectra.sage import Estimate as Estimate
+    from rf3dgs.spectra.sage import estimate_paths as estimate_paths
     from rf3dgs.spectra.scan import array_instrument as array_instrument
     from rf3dgs.spectra.scan import spectrum_of as spectrum_of
     from rf3dgs.spectra.spectrum import Instrument as Instrument
@@ -41,6 +46,11 @@ _HOMES = {
     "find_peaks": ".peaks",
     "main_peak": ".peaks",
     "resample": ".resampling",
+    "sage": ".sage",
+    "estimate_paths": ".sage",
+    "Estimate": ".sage",
+    "cramer_rao": ".crb",
+    "Bound": ".crb",
 }
 __all__ = [  # noqa: RUF022 (reading order)
     "Spectrum",
@@ -60,5 +70,10 @@ __all__ = [  # noqa: RUF022 (reading order)
     "find_peaks",
     "main_peak",
     "resample",
+    "sage",
+    "estimate_paths",
+    "Estimate",
+    "cramer_rao",
+    "Bound",
 ]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)
