@@ -47,7 +47,7 @@ class PathsWriter:
         self._meta = json.dumps(dict(meta or {}), allow_nan=False)
         self._stack = ExitStack()
         self._file: h5py.File | None = None
-        self._columns: tuple[str, ...] = ()
+        self._columns: dict[str, h5py.Dataset] = {}
         self._offset = [0]
         self._rx: list[Pose] = []
         self._traced: list[int | None] = []
@@ -88,17 +88,13 @@ class PathsWriter:
         if not all(np.isfinite(value).all() for value in columns.values()):
             raise InputError(f"paths for {self.path} have NaN or infinite values; mark such entries as not valid")
         if not self._columns:
-            self._columns = tuple(columns)
-            for name, value in columns.items():
-                self._create(name, value.dtype)
-        if tuple(columns) != self._columns:
-            raise InputError(f"{self.path} holds the columns {self._columns}; got {tuple(columns)}")
+            self._columns = {name: self._create(name, value.dtype) for name, value in columns.items()}
+        if list(columns) != list(self._columns):
+            raise InputError(f"{self.path} holds the columns {tuple(self._columns)}; got {tuple(columns)}")
         end = self._offset[-1] + len(columns["delay"])
         for name, value in columns.items():
-            dataset = self._file[name]
-            assert isinstance(dataset, h5py.Dataset)
-            dataset.resize((end,))
-            dataset[self._offset[-1] :] = value
+            self._columns[name].resize((end,))
+            self._columns[name][self._offset[-1] :] = value
         self._offset.append(end)
         self._rx.append(paths.rx)
         self._traced.append(traced)
@@ -114,9 +110,9 @@ class PathsWriter:
             raise
         self._stack.__exit__(kind, error, trace)
 
-    def _create(self, name: str, dtype: np.dtype) -> None:
+    def _create(self, name: str, dtype: np.dtype) -> h5py.Dataset:
         assert self._file is not None
-        self._file.create_dataset(
+        return self._file.create_dataset(
             name,
             shape=(0,),
             maxshape=(None,),
@@ -131,6 +127,10 @@ class PathsWriter:
     def _finish(self) -> None:
         assert self._file is not None
         file = self._file
+        # Space in the file is given out when a dataset is flushed. Left to the moment when Python drops the dataset,
+        # which a profiler or a debugger may put off, the same paths would make files of different bytes.
+        for dataset in self._columns.values():
+            dataset.flush()
         if not self._rx:
             raise InputError(f"no receiver was written to {self.path}; append the paths of at least one")
         head = {
@@ -144,7 +144,7 @@ class PathsWriter:
         if len(traced) == len(self._rx):
             head["rx_traced"] = np.asarray(traced, dtype=np.int64)
         for name, value in head.items():
-            file.create_dataset(name, data=value, fletcher32=True)
+            file.create_dataset(name, data=value, fletcher32=True).flush()
 
 
 def _columns(paths: Paths) -> dict[str, np.ndarray]:

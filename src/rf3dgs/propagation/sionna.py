@@ -209,9 +209,7 @@ def _paths(columns: list[NDArray], frequency: float, tx: Pose, rx: Pose) -> Path
     )
 
 
-def _check(
-    scene: Scene, tx: Pose, rx: Pose, config: TraceConfig, frequency: float, numbers: Sequence[int]
-) -> None:
+def _check(scene: Scene, tx: Pose, rx: Pose, config: TraceConfig, frequency: float, numbers: Sequence[int]) -> None:
     """Refuse what cannot be traced, naming the receiver and what is in its way."""
     if tx.batch_shape or len(rx.batch_shape) != 1:
         raise InputError(f"tx must be one pose and rx a list [rx]; got {tx.batch_shape} and {rx.batch_shape}")

@@ -85,9 +85,13 @@ class TraceJob:
     label: str = "tracing"
     run: str = field(default_factory=lambda: secrets.token_hex(8))
 
-    @cached_property
+    @property
     def plan(self) -> Manifest:
         """The arguments as the manifest holds them; scene and poses as their sha256, since each shard has its poses."""
+        return self._plan
+
+    @cached_property
+    def _plan(self) -> Manifest:
         scene = _scene(self.scene, self.run)
         place = {"position": self.tx.position.tolist(), "orientation": self.tx.orientation.tolist()}
         config = {name: value for name, value in asdict(self.config).items() if name != "frequency"}
