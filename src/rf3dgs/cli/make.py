@@ -1,6 +1,5 @@
 """`trace`, `photos` and `spectra`: from a scene to a dataset folder."""
 
-import re
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -77,7 +76,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class MakePhotos:
-    """Render posed photographs of a scene with Mitsuba, in nerfstudio's layout."""
+    """Render posed photographs of a scene with Mitsuba, in nerfstudio's layout; a killed run goes on."""
 
     scene: tyro.conf.Positional[str]
     """"lobby", a scene that ships with Sionna RT, or a Sionna/Mitsuba XML file."""
@@ -86,24 +85,31 @@ class MakePhotos:
     tour_seed: int = 0
     """Decides where the cameras stand."""
     out: Path = Path("lobby/photos")
-    """The folder to write: pictures and transforms.json; a tour already there is replaced."""
+    """The folder to write: pictures, a manifest, and transforms.json at the end."""
     photo: PhotoConfig = field(default_factory=PhotoConfig)
     """How photographs are rendered."""
+    shard_size: int = 10
+    """Photographs in one shard, which is what a killed run may have to do again."""
+    workers: int = 1
+    """Processes on this machine; more than one needs the extra "cluster"."""
+    cluster: str | None = None
+    """The address of a dask scheduler, such as tcp://10.0.0.5:8786, whose workers do the rendering."""
 
     def run(self) -> int:
-        """Render and write all of them, or nothing."""
-        from rf3dgs.cli.chain import photograph
+        """Render what the folder lacks, then write the cameras."""
+        from rf3dgs.cli.chain import photos_of, shots_of_tour
         from rf3dgs.cli.facts import open_scene
-        from rf3dgs.core.files import atomic_folder
         from rf3dgs.data.formats.nerfstudio import write_nerfstudio
+        from rf3dgs.propagation.jobs import run_job
+        from rf3dgs.propagation.photo_job import PhotoJob
 
-        if self.count < 1:
-            raise InputError(f"--count must be at least 1; got {self.count}")
-        _refuse_other_folder(self.out)
-        scene = open_scene(self.scene)
-        with atomic_folder(self.out) as folder:
-            photos = photograph(scene, self.count, self.tour_seed, self.photo, folder, console())
-            write_nerfstudio(folder, photos)
+        _at_least_one(("--count", self.count), ("--shard-size", self.shard_size), ("--workers", self.workers))
+        crew = _crew(self.workers, self.cluster)
+        shots = shots_of_tour(open_scene(self.scene), self.count, self.tour_seed, self.photo)
+        rule = {"how": "a walk", "seed": self.tour_seed}
+        job = PhotoJob(self.scene, shots, rule, self.shard_size)
+        run_job(job, self.out, crew=crew, progress=console())
+        write_nerfstudio(self.out, photos_of(shots, self.out))
         out(f"{self.out}: {self.count} photographs of {self.photo.width}x{self.photo.height}")
         return 0
 
@@ -187,19 +193,6 @@ def _crew(workers: int, cluster: str | None) -> "AbstractContextManager[Crew] | 
     if workers != 1:
         raise InputError("--workers starts processes here, --cluster uses those of a scheduler; give one of them")
     return existing_cluster(cluster)
-
-
-def _refuse_other_folder(folder: Path) -> None:
-    """Refuse to replace a folder that holds anything but an earlier tour."""
-    from rf3dgs.data.formats.nerfstudio import FILE_NAME
-
-    items = folder.iterdir() if folder.is_dir() else ()
-    others = sorted(item.name for item in items if not re.fullmatch(rf"\d{{5}}\.jpg|{re.escape(FILE_NAME)}", item.name))
-    if others:
-        raise InputError(
-            f"{folder} would be replaced, but it holds something else than a tour, such as {others[0]}; choose another "
-            "name with --out"
-        )
 
 
 def _size_of(array: str) -> tuple[int, int]:

@@ -9,6 +9,8 @@ Who works is a `Crew`: `Here`, or the processes of `propagation.cluster`. Only t
 
 import contextlib
 import json
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -100,7 +102,7 @@ def run_job(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"cannot make the folder {folder}: {error.strerror}; choose another one") from error
-    with locked(folder):
+    with _ended_by_sigterm(), locked(folder):
         remove_partials(folder, older_than=0.0)
         old = load_manifest(folder) if (folder / manifests.NAME).exists() else None
         if old is not None:
@@ -117,6 +119,23 @@ def run_job(
                 _refuse_another(folder, old, plan)
             _make(job, folder, missing, workers, made_by, progress)
         return plan
+
+
+@contextlib.contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM, which batch systems send before SIGKILL, end the run so that its lock and its workers go too."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number: int, _: object) -> None:
+        raise SystemExit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _make(

@@ -4,7 +4,7 @@ import ctypes
 import hashlib
 import platform
 from dataclasses import fields, is_dataclass
-from functools import cache
+from functools import cache, lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from rf3dgs.propagation.llvm import find_llvm
+from rf3dgs.propagation.scene import Scene
 
 PACKAGES = ("rf3dgs", "sionna-rt", "mitsuba", "drjit", "torch", "numpy", "h5py", "pillow")
 
@@ -37,6 +38,19 @@ def toolchain() -> dict[str, str]:
         "llvm": ".".join(str(number.value) for number in numbers),
         "processor": f"{platform.machine()} {name}, instructions {used}",
     }
+
+
+@lru_cache(maxsize=2)
+def scene_of_run(scene: str | Scene, run: str) -> Scene:
+    """The scene `scene_of` builds, once per process and run: a process that serves several runs builds it anew."""
+    from rf3dgs.propagation.scenes import scene_of
+
+    return scene_of(scene)
+
+
+def made_by(scene: str | Scene, run: str) -> dict[str, str]:
+    """The toolchain, and the fingerprint of the scene as this process builds it."""
+    return {**toolchain(), "scene": fingerprint(scene_of_run(scene, run))}
 
 
 def fingerprint(value: object) -> str:

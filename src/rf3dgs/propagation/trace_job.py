@@ -16,7 +16,7 @@ from rf3dgs.core.manifest import Manifest
 from rf3dgs.propagation.config import TraceConfig
 from rf3dgs.propagation.jobs import Each
 from rf3dgs.propagation.scene import Scene
-from rf3dgs.propagation.toolchain import fingerprint, toolchain
+from rf3dgs.propagation.toolchain import fingerprint, made_by, scene_of_run
 
 SHARD_SIZE = 25
 """Receivers in a shard unless said otherwise: half a minute of work, and some hundred megabytes."""
@@ -40,14 +40,14 @@ class TraceTask:
 
     def made_by(self) -> Mapping[str, object]:
         """The versions, the processor, and the scene as this process builds it."""
-        return {**toolchain(), "scene": fingerprint(_scene(self.scene, self.run))}
+        return made_by(self.scene, self.run)
 
     def make(self, each: Each) -> Mapping[str, bytes]:
         """The bytes of an HDF5 file of paths, diffuse ones merged."""
         from rf3dgs.propagation.sionna import trace_each
 
         tracer = _tracer(self.scene, self.frequency, self.run)
-        scene, config = _scene(self.scene, self.run), self.config
+        scene, config = scene_of_run(self.scene, self.run), self.config
         cell = math.radians(config.cell_deg)
         content = BytesIO()
         with PathsWriter(content, self.frequency, self.tx, self.meta) as writer:
@@ -92,7 +92,7 @@ class TraceJob:
 
     @cached_property
     def _plan(self) -> Manifest:
-        scene = _scene(self.scene, self.run)
+        scene = scene_of_run(self.scene, self.run)
         place = {"position": self.tx.position.tolist(), "orientation": self.tx.orientation.tolist()}
         config = {name: value for name, value in asdict(self.config).items() if name != "frequency"}
         made_from = {
@@ -128,15 +128,8 @@ class TraceJob:
         )
 
 
-@lru_cache(maxsize=2)
-def _scene(scene: str | Scene, run: str) -> Scene:
-    from rf3dgs.propagation.scenes import scene_of
-
-    return scene_of(scene)
-
-
 @lru_cache(maxsize=1)
 def _tracer(scene: str | Scene, frequency: float, run: str):
     from rf3dgs.propagation.sionna import Tracer
 
-    return Tracer(_scene(scene, run), frequency)
+    return Tracer(scene_of_run(scene, run), frequency)
