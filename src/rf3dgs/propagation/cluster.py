@@ -155,7 +155,7 @@ def local_processes(count: int) -> Iterator[DaskCrew]:
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
-            dashboard_address=None,  # type: ignore[arg-type]
+            dashboard_address="127.0.0.1:0",
             memory_limit=0,
             local_directory=scratch,
             silence_logs=logging.CRITICAL,
