@@ -5,6 +5,7 @@ import hashlib
 import os
 import resource
 import signal
+import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -82,6 +83,28 @@ class FakeJob:
     def task(self, shard):
         self.asked.append(shard)
         return FakeTask(self.plan.part(shard), self.seconds, **(self.common | self.special.get(shard, {})))
+
+
+def files_of(folder):
+    return {item.name: item.read_bytes() for item in sorted(folder.iterdir())}
+
+
+def command(out, *options):
+    return [sys.executable, "-m", "tests.propagation.fake_work", str(out), *map(str, options)]
+
+
+def text_of(path):
+    try:
+        return path.read_text()
+    except OSError:
+        return ""
+
+
+def wait_for(condition, seconds=20.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "it never happened"
+        time.sleep(0.01)
 
 
 def main() -> None:

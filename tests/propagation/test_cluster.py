@@ -8,12 +8,11 @@ import sys
 
 import psutil
 import pytest
+from tests.propagation.fake_work import FakeJob, command, files_of, wait_for
 
 from rf3dgs.core.errors import DataError, InputError, MissingDependencyError, RfError
 from rf3dgs.propagation import cluster
 from rf3dgs.propagation.jobs import Here, run_job
-from tests.propagation.fake_work import FakeJob
-from tests.propagation.test_jobs import command, files_of, wait_for
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")

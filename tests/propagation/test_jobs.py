@@ -1,27 +1,17 @@
 """The job runner with cheap work: killed, refused, out of disk, and always the same bytes in the end."""
 
 import json
-import os
 import random
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import replace
 
 import pytest
+from tests.propagation.fake_work import FakeJob, command, content, files_of, text_of, wait_for
 
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.propagation.jobs import run_job
-from tests.propagation.fake_work import FakeJob, content
-
-
-def files_of(folder):
-    return {item.name: item.read_bytes() for item in sorted(folder.iterdir())}
-
-
-def command(out, *options):
-    return [sys.executable, "-m", "tests.propagation.fake_work", str(out), *map(str, options)]
 
 
 class Recorder:
@@ -82,26 +72,12 @@ def test_twenty_kills_at_random_moments_leave_the_bytes_of_a_calm_run(tmp_path):
     assert files_of(out) == files_of(tmp_path / "calm")
 
 
-def text_of(path):
-    try:
-        return path.read_text()
-    except OSError:
-        return ""
-
-
 def test_sigterm_ends_a_run_and_frees_its_folder(tmp_path):
     process = subprocess.Popen(command(tmp_path / "set", "--seconds", 0.2))
     wait_for(lambda: (tmp_path / "set" / "1.bin").exists())
     process.send_signal(signal.SIGTERM)
     assert process.wait(timeout=10) == 128 + signal.SIGTERM
     assert not (tmp_path / "set" / "lock.json").exists()
-
-
-def wait_for(condition, seconds=20.0):
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "it never happened"
-        time.sleep(0.01)
 
 
 def test_other_arguments_are_refused_and_the_first_difference_is_named(tmp_path):
@@ -181,7 +157,7 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match=r"cannot make the folder .*: Not a directory; choose another one"):
         run_job(FakeJob(), tmp_path / "file" / "set")
-    assert os.listdir(tmp_path) == ["file"]
+    assert [item.name for item in tmp_path.iterdir()] == ["file"]
 
 
 def test_what_killed_writers_left_is_swept_away(tmp_path):
