@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         complain(str(error))
         return 2
     except KeyboardInterrupt:
-        complain("interrupted; a started training run resumes from its last checkpoint")
+        complain("interrupted; the same command again goes on with what takes long: tracing, photographs, training")
         return 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
