@@ -23,6 +23,10 @@ class TraceConfig:
     """Whether mirror-like reflections are traced."""
     diffuse: bool = True
     """Whether diffuse reflections are traced."""
+    refraction: bool = False
+    """Whether rays pass through walls; what passes an outer wall is lost."""
+    diffraction: bool = False
+    """Whether rays bend round the edges of solid objects, once per path."""
     cell_deg: float = 1.0
     """`trace` merges diffuse paths that arrive within one cell of this size [deg] ..."""
     delay_step: float = 1e-9

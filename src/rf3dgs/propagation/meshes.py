@@ -1,6 +1,7 @@
 """Triangles: distances to them, what they enclose, their colours, and the files they are kept in."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -87,6 +88,15 @@ def coloured(item: "SceneObject", longest_edge: float | None) -> tuple[Tensor, T
     row = (centre[:, 1] * height).long().clamp(0, height - 1)
     col = (centre[:, 0] * width).long().clamp(0, width - 1)
     return vertices, faces, torch.from_numpy(item.texture.copy())[row, col].float() / 255.0
+
+
+def welded(item: "SceneObject") -> "SceneObject":
+    """The object with one vertex for all corners within 0.1 mm, without its texture and triangles that vanish."""
+    _, corner, count = torch.unique((item.vertices * 1e4).round(), dim=0, return_inverse=True, return_counts=True)
+    first = corner.argsort(stable=True)[count.cumsum(0) - count]
+    faces = corner[item.faces]
+    distinct = (faces != faces.roll(1, 1)).all(1)
+    return replace(item, vertices=item.vertices[first], faces=faces[distinct], texture=None, uv=None)
 
 
 def write_mesh(path: Path, vertices: Tensor, faces: Tensor, uv: Tensor | None) -> None:

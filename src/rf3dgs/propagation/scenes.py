@@ -11,7 +11,7 @@ from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.propagation.lobby import lobby
 from rf3dgs.propagation.scene import Bounds, Scene, SceneObject
-from rf3dgs.propagation.scene_files import check_foreign_xml
+from rf3dgs.propagation.scene_files import check_foreign_xml, lobe_of_name
 
 
 @dataclass(frozen=True)
@@ -119,6 +119,7 @@ def _object(name: str, item, scattering: float) -> SceneObject:
         scattering=own if own > 0 else scattering,
         thickness=float(np.array(material.thickness).reshape(-1)[0]),
         colour=colour if len(colour) == 3 else (0.6, 0.6, 0.6),
+        alpha_r=lobe_of_name(material.name),
     )
 
 
