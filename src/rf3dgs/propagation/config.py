@@ -1,6 +1,7 @@
 """What can be chosen about tracing and photographing; free of heavy imports, so that `--help` is instant."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,30 @@ class TraceConfig:
     """`trace` merges diffuse paths that arrive within one cell of this size [deg] ..."""
     delay_step: float = 1e-9
     """... and within this delay [s]; line of sight and purely specular paths are kept exactly."""
+
+
+@dataclass(frozen=True)
+class ReceiverConfig:
+    """Where receivers stand."""
+
+    kind: Literal["random", "grid", "route"] = "random"
+    """Drawn uniformly in the free space, on a regular grid in it, or along a walked route."""
+    count: int = 72
+    """How many are drawn; random only."""
+    seed: int = 0
+    """Decides where they are drawn; random only."""
+    spacing: float = 0.5
+    """Distance [m] between neighbours of a grid."""
+    route: tuple[tuple[float, float], ...] = ()
+    """Waypoints (x, y) [m] of a route."""
+    speed: float = 1.0
+    """Speed of the walk along a route [m/s] ..."""
+    interval: float = 0.25
+    """... and time between two of its receivers [s]."""
+    height: float | None = None
+    """Height above the ground [m]; the scene's own heights, or their middle on grids and routes, when absent."""
+    clearance: float = 0.35
+    """Least distance from every surface [m]."""
 
 
 @dataclass(frozen=True)

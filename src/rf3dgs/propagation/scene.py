@@ -157,6 +157,12 @@ class Scene:
                 return item.name
         return None
 
+    def nearest(self, point: Tensor) -> tuple[str, float]:
+        """The object whose surface is nearest to `point` `[3]`, and its distance [m]."""
+        found = {item.name: float(meshes.distance(point[None], item.vertices[item.faces])) for item in self.objects}
+        name = min(found, key=lambda name: found[name])
+        return name, found[name]
+
     def receivers(self, count: int, seed: int, *, clearance: float = 0.35) -> Pose:
         """`count` level poses drawn uniformly in the free part of `rx_bounds`, `clearance` [m] from every surface."""
         return Pose(self.free_points(self.rx_bounds, count, seed, clearance=clearance))
