@@ -7,10 +7,14 @@ from rf3dgs.core.lazy import lazy_names
 if TYPE_CHECKING:
     from rf3dgs.propagation import sionna as sionna
     from rf3dgs.propagation.config import PhotoConfig as PhotoConfig
+    from rf3dgs.propagation.config import ReceiverConfig as ReceiverConfig
     from rf3dgs.propagation.config import TraceConfig as TraceConfig
     from rf3dgs.propagation.llvm import find_llvm as find_llvm
     from rf3dgs.propagation.photographer import camera_tour as camera_tour
     from rf3dgs.propagation.photographer import render_photos as render_photos
+    from rf3dgs.propagation.presets import Preset as Preset
+    from rf3dgs.propagation.presets import preset_of as preset_of
+    from rf3dgs.propagation.receivers import receivers_of as receivers_of
     from rf3dgs.propagation.scene import Scene as Scene
     from rf3dgs.propagation.scene import SceneObject as SceneObject
     from rf3dgs.propagation.scene_files import write_radio_scene as write_radio_scene
@@ -21,6 +25,10 @@ _HOMES = {
     "Scene": ".scene",
     "SceneObject": ".scene",
     "scene_of": ".scenes",
+    "Preset": ".presets",
+    "preset_of": ".presets",
+    "ReceiverConfig": ".config",
+    "receivers_of": ".receivers",
     "write_radio_scene": ".scene_files",
     "write_visual_scene": ".scene_files",
     "TraceConfig": ".config",
@@ -34,6 +42,10 @@ __all__ = [  # noqa: RUF022 (reading order)
     "Scene",
     "SceneObject",
     "scene_of",
+    "Preset",
+    "preset_of",
+    "ReceiverConfig",
+    "receivers_of",
     "write_radio_scene",
     "write_visual_scene",
     "TraceConfig",
