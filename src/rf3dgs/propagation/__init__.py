@@ -1,4 +1,7 @@
-"""Where paths come from: scenes, the ray tracer, and the camera that photographs the same meshes."""
+"""Where paths come from: scenes, the ray tracer, and the camera that photographs the same meshes.
+
+`coverage.coverage` bears the name of its module and is imported from there.
+"""
 
 from typing import TYPE_CHECKING
 
@@ -9,8 +12,10 @@ if TYPE_CHECKING:
     from rf3dgs.propagation.config import PhotoConfig as PhotoConfig
     from rf3dgs.propagation.config import ReceiverConfig as ReceiverConfig
     from rf3dgs.propagation.config import TraceConfig as TraceConfig
+    from rf3dgs.propagation.coverage import Coverage as Coverage
     from rf3dgs.propagation.llvm import find_llvm as find_llvm
-    from rf3dgs.propagation.photographer import camera_tour as camera_tour
+    from rf3dgs.propagation.photographer import render_panorama as render_panorama
+    from rf3dgs.propagation.photographer import render_panoramas as render_panoramas
     from rf3dgs.propagation.photographer import render_photos as render_photos
     from rf3dgs.propagation.presets import Preset as Preset
     from rf3dgs.propagation.presets import preset_of as preset_of
@@ -20,6 +25,7 @@ if TYPE_CHECKING:
     from rf3dgs.propagation.scene_files import write_radio_scene as write_radio_scene
     from rf3dgs.propagation.scene_files import write_visual_scene as write_visual_scene
     from rf3dgs.propagation.scenes import scene_of as scene_of
+    from rf3dgs.propagation.walks import camera_tour as camera_tour
 
 _HOMES = {
     "Scene": ".scene",
@@ -34,8 +40,11 @@ _HOMES = {
     "TraceConfig": ".config",
     "sionna": ".sionna",
     "PhotoConfig": ".config",
-    "camera_tour": ".photographer",
+    "camera_tour": ".walks",
+    "Coverage": ".coverage",
     "render_photos": ".photographer",
+    "render_panorama": ".photographer",
+    "render_panoramas": ".photographer",
     "find_llvm": ".llvm",
 }
 __all__ = [  # noqa: RUF022 (reading order)
@@ -52,7 +61,10 @@ __all__ = [  # noqa: RUF022 (reading order)
     "sionna",
     "PhotoConfig",
     "camera_tour",
+    "Coverage",
     "render_photos",
+    "render_panorama",
+    "render_panoramas",
     "find_llvm",
 ]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -68,6 +68,8 @@ class PhotoConfig:
     """Rows."""
     fov_deg: float = 85.0
     """Horizontal field of view [deg]."""
+    walk: Literal["level", "coverage"] = "level"
+    """Once round looking across, or also out at the walls, down at the floor and up at the ceiling."""
     samples: int = 64
     """Light paths per pixel, rounded up to a square number; noise falls with the square root."""
     held_out_samples: int | None = None
