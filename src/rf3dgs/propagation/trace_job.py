@@ -46,7 +46,7 @@ class TraceTask:
         """The bytes of an HDF5 file of paths, diffuse ones merged."""
         from rf3dgs.propagation.sionna import trace_each
 
-        tracer = _tracer(self.scene, self.frequency, self.run)
+        tracer = _tracer(self.scene, self.frequency, self.config.diffraction, self.run)
         scene, config = scene_of_run(self.scene, self.run), self.config
         cell = math.radians(config.cell_deg)
         content = BytesIO()
@@ -129,7 +129,7 @@ class TraceJob:
 
 
 @lru_cache(maxsize=1)
-def _tracer(scene: str | Scene, frequency: float, run: str):
+def _tracer(scene: str | Scene, frequency: float, diffraction: bool, run: str):
     from rf3dgs.propagation.sionna import Tracer
 
-    return Tracer(scene_of_run(scene, run), frequency)
+    return Tracer(scene_of_run(scene, run), frequency, diffraction=diffraction)
