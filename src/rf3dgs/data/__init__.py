@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rf3dgs.data.formats.nerfstudio import read_nerfstudio as read_nerfstudio
     from rf3dgs.data.formats.nerfstudio import write_nerfstudio as write_nerfstudio
     from rf3dgs.data.formats.rf3dgs_v0 import read_rf3dgs_v0 as read_rf3dgs_v0
-    from rf3dgs.data.formats.spectra_h5 import Precision as Precision
+    from rf3dgs.data.formats.spectra_codes import Precision as Precision
     from rf3dgs.data.photo import Photo as Photo
     from rf3dgs.data.photo import PhotoSet as PhotoSet
     from rf3dgs.data.sfm import poses_from_photos as poses_from_photos
@@ -30,7 +30,7 @@ _MODULES = {
     "Part": ".dataset",
     "Photo": ".photo",
     "PhotoSet": ".photo",
-    "Precision": ".formats.spectra_h5",
+    "Precision": ".formats.spectra_codes",
     "split_positions": ".split",
     "read_photos": ".formats.detect",
     "read_colmap": ".formats.colmap",

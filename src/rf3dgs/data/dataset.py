@@ -18,7 +18,7 @@ from rf3dgs.data.split import SEALED_ROLES, check_roles, every_kth, split_positi
 from rf3dgs.spectra.spectrum import Spectrum
 
 if TYPE_CHECKING:
-    from rf3dgs.data.formats.spectra_h5 import Precision
+    from rf3dgs.data.formats.spectra_codes import Precision
 
 LOG_NAME = "test_reads.log"
 _log = logging.getLogger(__name__)
