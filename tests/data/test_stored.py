@@ -122,9 +122,10 @@ def test_parts_written_one_by_one_are_one_file_in_the_end(spectra, tmp_path):
     parts = []
     for start in range(0, 20, 7):
         parts.append(tmp_path / f"{start}.h5")
-        write_part(parts[-1], spectra[start : start + 7], scales, {"generator": "test", "seed": 3})
+        some = [spectra[start : start + 4], spectra[start + 4 : min(start + 7, 20)]]
+        write_part(parts[-1], some, sum(map(len, some)), scales, {"generator": "test", "seed": 3})
     join_parts(parts, tmp_path / "joined.h5", 20)
-    write_part(tmp_path / "at-once.h5", spectra, scales, {"generator": "test", "seed": 3})
+    write_part(tmp_path / "at-once.h5", [spectra], 20, scales, {"generator": "test", "seed": 3})
     joined, _, _ = read_spectra(tmp_path / "joined.h5")
     at_once, _, _ = read_spectra(tmp_path / "at-once.h5")
     assert same(joined, at_once)
@@ -136,9 +137,9 @@ def test_parts_written_one_by_one_are_one_file_in_the_end(spectra, tmp_path):
     with pytest.raises(InputError, match="expected 21 spectra; got 20"):
         join_parts(parts, tmp_path / "short.h5", 21)
     with pytest.raises(InputError, match=r"delay must lie between .* to be stored in steps of"):
-        write_part(tmp_path / "late.h5", spectra, common_scales(Precision(delay=1e-13), longest=1e-9), {})
+        write_part(tmp_path / "late.h5", [spectra], 20, common_scales(Precision(delay=1e-13), longest=1e-9), {})
     other = common_scales(Precision(gain_db=0.01), longest=float(spectra.delay.max()))
-    write_part(tmp_path / "other.h5", spectra, other, {})
+    write_part(tmp_path / "other.h5", [spectra], 20, other, {})
     with pytest.raises(DataError, match=r"other\.h5: is stored in other scales than the parts before"):
         join_parts([parts[0], tmp_path / "other.h5"], tmp_path / "mixed.h5", 27)
 

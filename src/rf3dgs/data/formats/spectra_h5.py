@@ -7,7 +7,7 @@ One picture is one chunk, so that one spectrum is read without the others.
 """
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,12 +56,18 @@ def write_spectra(
             group.create_dataset("index", data=index.numpy().astype(np.int32), track_times=False)
 
 
-def write_part(path: Path, spectra: Spectrum, scales: Mapping[str, Scale], meta: Mapping[str, Any]) -> None:
-    """Write some of the spectra of a run in `scales` that all its parts share (`common_scales`), for `join_parts`."""
+def write_part(
+    path: Path, spectra: Iterable[Spectrum], count: int, scales: Mapping[str, Scale], meta: Mapping[str, Any]
+) -> None:
+    """Write `count` spectra of a run, which come one `[n, row, col]` after the other, for `join_parts`.
+
+    All parts share their `scales` (`common_scales`).
+    """
     with h5py.File(path, "w", libver=LIBVER) as file:
         _write_top(file, meta)
-        writer = _GroupWriter(file.create_group("spectra"), len(spectra), scales, None)
-        writer.append(spectra)
+        writer = _GroupWriter(file.create_group("spectra"), count, scales, None)
+        for some in spectra:
+            writer.append(some)
         writer.finish()
 
 
@@ -253,7 +259,7 @@ class _GroupWriter:
                 dtype=np.uint16,
                 chunks=(*(1,) * (len(shape) - 1), *shape[-2:]),
                 compression="gzip",
-                compression_opts=9,
+                compression_opts=6,
                 shuffle=True,
                 fletcher32=True,
             )

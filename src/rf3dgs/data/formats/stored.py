@@ -19,7 +19,7 @@ from rf3dgs.data.formats.spectra_codes import MISSING, Scale, vector_of
 from rf3dgs.data.formats.spectra_head import Head
 from rf3dgs.spectra.spectrum import Spectrum
 
-AT_ONCE = 2**24  # pixels that a pass over many spectra holds at a time
+AT_ONCE = 2**19  # pixels that a pass over many spectra holds at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,6 +171,6 @@ class StoredSpectra(Spectrum):
 
 def blocks(spectra: Spectrum) -> Iterator[Spectrum]:
     """The spectra `[position, row, col]` in blocks of a few, in order, so that a pass over a file stays small."""
-    step = max(1, AT_ONCE // 8 // (spectra.grid.height * spectra.grid.width))
+    step = max(1, AT_ONCE // (spectra.grid.height * spectra.grid.width))
     for start in range(0, len(spectra), step):
         yield spectra[start : start + step]
