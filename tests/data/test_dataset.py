@@ -16,7 +16,8 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import list_grid, pinhole_grid
 from rf3dgs.core.hdf5 import open_audited, read_attribute
 from rf3dgs.data.dataset import Dataset
-from rf3dgs.data.formats.spectra_h5 import Precision, octahedral_of, read_spectra, vector_of, write_spectra
+from rf3dgs.data.formats.spectra_codes import Precision, octahedral_of, vector_of
+from rf3dgs.data.formats.spectra_h5 import read_spectra, write_spectra
 from rf3dgs.data.photo import Photo
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 

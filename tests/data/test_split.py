@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.data.split import check_roles, every_kth, places_of, split_positions
+from rf3dgs.data.split import FRACTIONS, check_roles, every_kth, keep_fraction, places_of, protocol, split_positions
 
 ROOM = ((0, 0, 1), (14, 15, 2))
 
@@ -82,3 +82,56 @@ def test_every_kth_photo_is_tested():
     assert set(every_kth(9, 0)) == {"train"}
     with pytest.raises(InputError, match="at least 2"):
         every_kth(9, 1)
+
+
+def test_the_papers_protocol_holds_out_160_of_800():
+    positions = Pose.scatter(ROOM, 800, seed=0).position
+    roles = protocol(positions, seed=1)
+    assert (roles.count("test"), roles.count("train")) == (160, 640)
+    assert roles == protocol(positions, seed=1)
+    assert roles != protocol(positions, seed=2)
+    region = protocol(positions, hold_out="region", seed=1)
+    assert region.count("region") == 160
+    assert region.count("region") + region.count("buffer") + region.count("train") == 800
+
+
+@settings(max_examples=20, deadline=None)
+@given(count=st.integers(20, 120), seed=st.integers(0, 1000), hold_out=st.sampled_from(["random", "region"]))
+def test_fractions_are_nested_and_leave_the_held_out_alone(count, seed, hold_out):
+    positions = Pose.scatter(ROOM, count, seed=seed).position.repeat_interleave(4, 0)
+    whole = protocol(positions, hold_out=hold_out, seed=seed)
+    before: set[int] = set()
+    for fraction in FRACTIONS:
+        roles = protocol(positions, hold_out=hold_out, fraction=fraction, seed=seed)
+        train = {index for index, role in enumerate(roles) if role == "train"}
+        assert before <= train
+        assert len(train) == 4 * round(fraction * whole.count("train") / 4)
+        assert {index // 4 for index in train} == {index // 4 for index in train if index % 4 == 2}, "all four or none"
+        kept = [(new, old) for new, old in zip(roles, whole, strict=True) if old != "train"]
+        assert all(new == old for new, old in kept)
+        assert keep_fraction(positions, roles, 1.0, seed=seed) == whole
+        before = train
+    assert roles == whole
+
+
+@settings(max_examples=20, deadline=None)
+@given(count=st.integers(20, 60), seed=st.integers(0, 1000), hold_out=st.sampled_from(["random", "region"]))
+def test_the_pictures_of_one_place_are_on_one_side(count, seed, hold_out):
+    positions = Pose.scatter(ROOM, count, seed=seed).position.repeat_interleave(4, 0)
+    order = torch.randperm(len(positions), generator=torch.Generator().manual_seed(seed))
+    roles = protocol(positions[order], hold_out=hold_out, fraction=0.4, seed=seed)
+    sides: dict[int, set[str]] = {}
+    for index, role in zip(order.tolist(), roles, strict=True):
+        sides.setdefault(index // 4, set()).add(role)
+    assert all(len(side) == 1 for side in sides.values())
+
+
+def test_wrong_fractions_are_refused():
+    positions = Pose.scatter(ROOM, 30, seed=0).position
+    for fraction in (0.0, -0.2, 1.5, float("nan")):
+        with pytest.raises(InputError, match=r"fraction must lie in \(0, 1\]"):
+            protocol(positions, fraction=fraction)
+    with pytest.raises(InputError, match="leaves none; take a larger one"):
+        protocol(positions, fraction=0.01)
+    with pytest.raises(InputError, match='hold_out must be "random" or "region"'):
+        protocol(positions, hold_out="corner")

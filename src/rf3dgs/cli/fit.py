@@ -83,6 +83,8 @@ class FitRadio:
     """The field folder to write."""
     estimate_tx: bool = False
     """Estimate where the transmitter stands although the dataset knows it."""
+    fraction: float | None = None
+    """Train on this share of the training positions, such as 0.2; smaller shares are part of larger ones."""
     preset: Preset | None = None
     """All settings of the radio stage at once, in place of --radio.* (the seed stays)."""
     radio: RadioConfig = field(default_factory=RadioConfig)
@@ -94,7 +96,7 @@ class FitRadio:
         from rf3dgs.splats.ply import read_ply
 
         radio = chosen_radio(self.preset, self.radio)
-        geometry, dataset = read_ply(self.geometry), open_dataset(self.dataset)
+        geometry, dataset = read_ply(self.geometry), reduced(open_dataset(self.dataset), self.fraction)
         fit_field(geometry, dataset, self.out, radio, self.estimate_tx, source=str(self.geometry))
         return 0
 
@@ -113,6 +115,8 @@ class Fit:
     """Gaussians on a mesh."""
     estimate_tx: bool = False
     """Estimate where the transmitter stands although the dataset knows it."""
+    fraction: float | None = None
+    """Train on this share of the training positions, such as 0.2; smaller shares are part of larger ones."""
     visual: VisualConfig = field(default_factory=VisualConfig)
     """The visual stage."""
     preset: Preset | None = None
@@ -126,7 +130,7 @@ class Fit:
         from rf3dgs.training.visual import fit_geometry
 
         radio = chosen_radio(self.preset, self.radio)
-        dataset = open_dataset(self.dataset)
+        dataset = reduced(open_dataset(self.dataset), self.fraction)
         check_output(self.out)
         training_spectra(dataset)
         if self.mesh is not None:
@@ -148,6 +152,11 @@ def chosen_radio(preset: Preset | None, radio: RadioConfig) -> RadioConfig:
     if radio != RadioConfig(seed=radio.seed):
         raise InputError(f"--preset {preset} sets all of the radio stage; give it or --radio.*, not both")
     return RadioConfig.preset(preset, seed=radio.seed)
+
+
+def reduced(dataset: "Dataset", fraction: float | None) -> "Dataset":
+    """The dataset with a share of its training positions; all of them when `fraction` is None."""
+    return dataset if fraction is None else dataset.with_fraction(fraction)
 
 
 def fit_field(

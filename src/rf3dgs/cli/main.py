@@ -16,8 +16,9 @@ from rf3dgs.cli.demo import Demo
 from rf3dgs.cli.exchange import Export, Import
 from rf3dgs.cli.fit import Fit, FitGeometry, FitRadio
 from rf3dgs.cli.judge import Eval
-from rf3dgs.cli.make import MakePhotos, MakeSpectra, Trace
+from rf3dgs.cli.make import MakePhotos, Trace
 from rf3dgs.cli.show import complain, out
+from rf3dgs.cli.spectra import MakeSpectra
 from rf3dgs.core.errors import RfError
 
 name = tyro.conf.subcommand

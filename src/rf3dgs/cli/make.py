@@ -1,4 +1,4 @@
-"""`trace`, `photos` and `spectra`: from a scene to a dataset folder."""
+"""`trace` and `photos`: from a scene to its paths and its photographs."""
 
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
@@ -114,60 +114,6 @@ class MakePhotos:
         return 0
 
 
-@dataclass(frozen=True)
-class MakeSpectra:
-    """Make spectra of traced paths and put them, with the photographs beside, into a dataset folder."""
-
-    paths: tyro.conf.Positional[Path]
-    """A file written by rf3dgs trace."""
-    out: Path = Path("lobby")
-    """The dataset folder; photographs already in its photos/ folder are kept."""
-    method: Literal["ideal", "bartlett", "tapered", "capon", "cbf", "tcbf", "mvdr"] = "ideal"
-    """Ideal narrow lobe, or an array's Bartlett (CBF), Hann-tapered (TCBF) or Capon (MVDR) spectrum."""
-    array: str = "8x8"
-    """Rows x columns of the receiving array, at half a wavelength; ideal spectra need none."""
-    pattern: Literal["isotropic", "dipole", "patch", "tr38901"] = "patch"
-    """The array's element."""
-    grid: Literal["sphere", "pinhole"] = "sphere"
-    """The whole sphere, or a pinhole picture that looks along the receiver's forward axis."""
-    size: tuple[int, int] | None = None
-    """Width and height [pixel]: 180 90 for a sphere, 300 200 for a pinhole unless given."""
-    fov_deg: float = 90.0
-    """Horizontal field of view of a pinhole [deg]."""
-    snr_db: float | None = None
-    """Signal-to-noise ratio at the elements [dB]; no noise unless given. Array methods only."""
-    seed: int = 0
-    """Of the noise and of the split."""
-
-    def run(self) -> int:
-        """Read, synthesise, split and write."""
-        from rf3dgs.channel.arrays import planar_array
-        from rf3dgs.channel.io import PathsReader
-        from rf3dgs.core.grids import equirect_grid, pinhole_grid
-        from rf3dgs.core.progress import track
-        from rf3dgs.data.dataset import Dataset
-        from rf3dgs.data.formats.detect import read_photos
-        from rf3dgs.spectra.scan import spectrum_of
-        from rf3dgs.spectra.spectrum import stack_spectra
-
-        rows, cols = _size_of(self.array)
-        array = None if self.method == "ideal" else planar_array(rows, cols, pattern=self.pattern)
-        if self.grid == "sphere":
-            grid = equirect_grid(*(self.size or (180, 90)))
-        else:
-            grid = pinhole_grid(*(self.size or (300, 200)), fov_deg=self.fov_deg)
-        with PathsReader(self.paths) as reader:
-            spectra = [
-                spectrum_of(paths, array, grid, method=self.method, snr_db=self.snr_db, seed=self.seed + index)
-                for index, paths in enumerate(track(reader, "spectra", len(reader), console()))
-            ]
-        photos = read_photos(self.out / "photos").photos if (self.out / "photos").is_dir() else ()
-        meta = {"generator": f"rf3dgs spectra, method {self.method}", "seed": self.seed}
-        Dataset(photos, stack_spectra(spectra), meta=meta).split(seed=self.seed).save(self.out)
-        out(f"{self.out}: {len(spectra)} spectra of {grid.width}x{grid.height}, {len(photos)} photographs")
-        return 0
-
-
 def _at_least_one(*options: tuple[str, int]) -> None:
     for name, value in options:
         if value < 1:
@@ -193,10 +139,3 @@ def _crew(workers: int, cluster: str | None) -> "AbstractContextManager[Crew] | 
     if workers != 1:
         raise InputError("--workers starts processes here, --cluster uses those of a scheduler; give one of them")
     return existing_cluster(cluster)
-
-
-def _size_of(array: str) -> tuple[int, int]:
-    rows, _, cols = array.partition("x")
-    if not (rows.isdigit() and cols.isdigit() and int(rows) and int(cols)):
-        raise InputError(f'--array must be rows x columns such as "8x8"; got {array!r}')
-    return int(rows), int(cols)

@@ -18,10 +18,13 @@ if TYPE_CHECKING:
     from rf3dgs.data.formats.nerfstudio import read_nerfstudio as read_nerfstudio
     from rf3dgs.data.formats.nerfstudio import write_nerfstudio as write_nerfstudio
     from rf3dgs.data.formats.rf3dgs_v0 import read_rf3dgs_v0 as read_rf3dgs_v0
-    from rf3dgs.data.formats.spectra_h5 import Precision as Precision
+    from rf3dgs.data.formats.spectra_codes import Precision as Precision
+    from rf3dgs.data.formats.stored import StoredSpectra as StoredSpectra
     from rf3dgs.data.photo import Photo as Photo
     from rf3dgs.data.photo import PhotoSet as PhotoSet
     from rf3dgs.data.sfm import poses_from_photos as poses_from_photos
+    from rf3dgs.data.split import keep_fraction as keep_fraction
+    from rf3dgs.data.split import protocol as protocol
     from rf3dgs.data.split import split_positions as split_positions
     from rf3dgs.data.validate import Fault as Fault
     from rf3dgs.data.video import photos_of_video as photos_of_video
@@ -31,8 +34,11 @@ _MODULES = {
     "Part": ".dataset",
     "Photo": ".photo",
     "PhotoSet": ".photo",
-    "Precision": ".formats.spectra_h5",
+    "Precision": ".formats.spectra_codes",
+    "StoredSpectra": ".formats.stored",
     "split_positions": ".split",
+    "protocol": ".split",
+    "keep_fraction": ".split",
     "read_photos": ".formats.detect",
     "read_colmap": ".formats.colmap",
     "write_colmap": ".formats.colmap",
@@ -51,7 +57,10 @@ __all__ = [  # noqa: RUF022
     "Photo",
     "PhotoSet",
     "Precision",
+    "StoredSpectra",
     "split_positions",
+    "protocol",
+    "keep_fraction",
     "read_photos",
     "read_colmap",
     "write_colmap",

@@ -14,11 +14,20 @@ from rf3dgs.core.errors import InputError, SealedError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid
 from rf3dgs.data.photo import Photo
-from rf3dgs.data.split import SEALED_ROLES, check_roles, every_kth, split_positions
+from rf3dgs.data.split import (
+    SEALED_ROLES,
+    HoldOut,
+    check_roles,
+    every_kth,
+    keep_fraction,
+    places_of,
+    protocol,
+    split_positions,
+)
 from rf3dgs.spectra.spectrum import Spectrum
 
 if TYPE_CHECKING:
-    from rf3dgs.data.formats.spectra_h5 import Precision
+    from rf3dgs.data.formats.spectra_codes import Precision
 
 LOG_NAME = "test_reads.log"
 _log = logging.getLogger(__name__)
@@ -28,6 +37,8 @@ _log = logging.getLogger(__name__)
 class Part:
     """One side of a split: its photos, its spectra `[position]`, and what a second solve saw at some of them.
 
+    Spectra of a loaded dataset stay in their file until they are looked at (`StoredSpectra`). Every access to
+    `dataset.train` makes a part anew: keep it in a variable, and what it has read is kept with it.
     `index` holds the places of these spectra among the dataset's; `repeat[i]` repeats `spectra[repeat_index[i]]`, and
     both are None where nothing was solved twice.
     """
@@ -45,9 +56,10 @@ class Dataset:
     """Photographs and spectra of one site, with a role for each.
 
     photos: the pictures, or a folder of them in any layout that `read_photos` knows.
-    spectra, repeat: see the properties; `repeat_index` `[n]` names the spectrum that each of `repeat` solves again with
+    spectra, repeat: see the properties; several spectra at one place (other orientations) are entries of their own.
+        `repeat_index` `[n]` names the spectrum that each of `repeat` solves again with
         another seed and ray count (the ceiling of any prediction).
-    roles: "train", "validation", "test", "region" (a held-out region) or "buffer" (around it, unused) per spectrum;
+    roles: "train", "validation", "test", "region" (a held-out region), "buffer" (around it) or "unused" per spectrum;
         photo_roles: "train", "validation" or "test" per photo. Empty before `split`.
     meta: what made the data: "generator" (text), "seed", and anything else that JSON can hold.
     path: the folder it was loaded from or saved to.
@@ -123,7 +135,10 @@ class Dataset:
 
     @classmethod
     def load(cls, path: str | Path, *, unseal_test: bool = False) -> "Dataset":
-        """Read a dataset folder; DataError names what is damaged, unsafe, or in other units or another version."""
+        """Open a dataset folder; DataError names what is damaged, unsafe, or in other units or another version.
+
+        Values of spectra stay in the file until they are asked for, so that a dataset may be larger than memory.
+        """
         from rf3dgs.data.formats.native import load_native
 
         return load_native(Path(path), unseal_test=unseal_test)
@@ -164,6 +179,39 @@ class Dataset:
             photo_roles=every_kth(len(self.photos), photo_test_every),
             meta=self.meta | {"split": how | {"photo_test_every": photo_test_every}},
             unseal_test=self.unseal_test if unseal_test is None else unseal_test,
+        )
+
+    def protocol(
+        self,
+        *,
+        hold_out: HoldOut = "random",
+        fraction: float = 1.0,
+        buffer: float = 0.3,
+        seed: int = 0,
+        photo_test_every: int = 8,
+    ) -> "Dataset":
+        """The same data with the roles of the paper's protocol, a fifth of the places held out (`split.protocol`)."""
+        how = {"hold_out": hold_out, "fraction": fraction, "buffer": buffer, "seed": seed}
+        return self._with(
+            roles=protocol(self.pose.position, hold_out=hold_out, fraction=fraction, buffer=buffer, seed=seed),
+            photo_roles=every_kth(len(self.photos), photo_test_every),
+            meta=self.meta | {"split": how | {"photo_test_every": photo_test_every}},
+        )
+
+    def with_fraction(self, fraction: float, *, seed: int | None = None) -> "Dataset":
+        """The same split with the share `fraction` of its training places; smaller ones are part of larger ones.
+
+        `seed` None takes that of the split.
+        """
+        if not self.roles:
+            raise InputError("the dataset has not been split; call split(test=0.15, seed=0) first")
+        if seed is None:
+            how = self.meta.get("split")
+            own = how.get("seed") if isinstance(how, dict) else None
+            seed = own if isinstance(own, int) else 0
+        return self._with(
+            roles=keep_fraction(self.pose.position, self.roles, fraction, seed=seed),
+            meta=self.meta | {"fraction": {"kept": fraction, "seed": seed}},
         )
 
     @property
@@ -239,6 +287,11 @@ class Dataset:
     def tx(self) -> Pose | None:
         """The transmitter's pose, when known."""
         return self._any().tx
+
+    @property
+    def places(self) -> Tensor:
+        """The number of the place `[position]` of each spectrum: spectra at one place (within 1 mm) have one number."""
+        return torch.from_numpy(places_of(self.pose.position)[0].astype("int64"))
 
     def where(self, role: str) -> Tensor:
         """The places `[n]` of a role among the positions."""

@@ -1,6 +1,7 @@
 """Splitting receiver positions into train, validation, test at random, and a held-out region behind a buffer."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,8 +12,11 @@ from torch import Tensor
 
 from rf3dgs.core.errors import InputError
 
-ROLES = ("train", "validation", "test", "region", "buffer")
+ROLES = ("train", "validation", "test", "region", "buffer", "unused")
 SEALED_ROLES = ("test", "region")
+HELD_OUT = 0.2  # share of the places that the paper's protocol tests on: 160 of 800
+FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)  # of the other places that it trains on
+HoldOut = Literal["random", "region"]
 SAME_PLACE = 1e-3  # [m] closer positions are one place
 
 
@@ -59,6 +63,42 @@ def split_positions(
     if not (role == "train").any():
         raise InputError(f"no place of {count} is left for training; lower test, validation, region or buffer")
     return tuple(str(role[index]) for index in place)
+
+
+def protocol(
+    positions: Tensor, *, hold_out: HoldOut = "random", fraction: float = 1.0, buffer: float = 0.3, seed: int = 0
+) -> tuple[str, ...]:
+    """The roles of the paper's protocol for positions `[n, 3]` [m]: a fifth of the places is held out, no validation.
+
+    hold_out "random": the "test" is drawn at random, 160 of 800 places. "region": the places of one "region", and those
+    up to `buffer` [m] around it serve nothing. Of the others the share `fraction` is "train" (`keep_fraction`).
+    """
+    if hold_out not in ("random", "region"):
+        raise InputError(f'hold_out must be "random" or "region"; got {hold_out!r}')
+    test, region = (HELD_OUT, 0.0) if hold_out == "random" else (0.0, HELD_OUT)
+    roles = split_positions(positions, test=test, validation=0.0, region=region, buffer=buffer, seed=seed)
+    return keep_fraction(positions, roles, fraction, seed=seed)
+
+
+def keep_fraction(positions: Tensor, roles: Sequence[str], fraction: float, *, seed: int = 0) -> tuple[str, ...]:
+    """The same roles with the share `fraction` of the training places kept as "train", the others "unused".
+
+    Places that are "unused" already take part, so that any fraction may follow any other. For one seed the smaller of
+    two fractions is part of the larger; all pictures of one place go the same way.
+    """
+    if not 0.0 < fraction <= 1.0:
+        raise InputError(f"fraction must lie in (0, 1], the share of the training places to keep; got {fraction}")
+    check_roles(positions, roles)
+    place, first = places_of(positions)
+    pool = np.array([roles[index] in ("train", "unused") for index in first], dtype=bool)
+    order = np.random.default_rng((seed, 1)).permutation(np.flatnonzero(pool))
+    kept = set(order[: round(fraction * len(order))].tolist())
+    if not kept:
+        raise InputError(f"a fraction of {fraction} of {len(order)} training places leaves none; take a larger one")
+    return tuple(
+        role if not pool[which] else "train" if which in kept else "unused"
+        for role, which in zip(roles, place.tolist(), strict=True)
+    )
 
 
 def check_roles(positions: Tensor, roles: Sequence[str]) -> None:

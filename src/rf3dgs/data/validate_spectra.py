@@ -10,11 +10,13 @@ from scipy.spatial import KDTree
 from rf3dgs.core.errors import DataError
 from rf3dgs.core.hdf5 import open_audited, read_array, read_attribute
 from rf3dgs.core.units import LONGEST_DELAY, shortest_delay
-from rf3dgs.data.formats.spectra_h5 import read_spectra
+from rf3dgs.data.formats.spectra_h5 import LARGEST, read_spectra
+from rf3dgs.data.survey import Survey, survey_of
 
 Found = Iterator[tuple[str, str]]
 
 MAX_GAIN_DB = 30.0
+SAMPLE = 256  # spectra whose units are looked at before every use; `spectra_faults` looks at all
 MAX_EXTENT = 1000.0  # [m] beyond it, positions without a delay that explains them are taken for millimetres
 
 
@@ -22,7 +24,7 @@ def spectra_faults(path: Path) -> Found:
     """Pairs (what, remedy) for one file of spectra; the values are looked at raw, so that one fault hides no other."""
     again = "Write the spectra again"
     try:
-        with open_audited(path) as file:
+        with open_audited(path, max_bytes=LARGEST) as file:
             if not isinstance(file.get("spectra"), h5py.Group):
                 yield "the group 'spectra' is missing", again
             for name, group in _groups(file):
@@ -40,10 +42,13 @@ def spectra_faults(path: Path) -> Found:
 
 
 def check_units(path: Path) -> None:
-    """Refuse a sound file of spectra whose values cannot be in the units it states: DataError with the remedy."""
-    with open_audited(path) as file:
+    """Refuse a sound file of spectra whose values cannot be in the units it states: DataError with the remedy.
+
+    Of many spectra 256 are looked at, from the first to the last.
+    """
+    with open_audited(path, max_bytes=LARGEST) as file:
         for name, group in _groups(file):
-            for what, remedy in _unit_faults(group, name):
+            for what, remedy in _unit_faults(group, name, survey_of(group, SAMPLE)):
                 raise DataError(f"{path}: {what}. {remedy}")
 
 
@@ -54,22 +59,24 @@ def _groups(file: h5py.File) -> list[tuple[str, h5py.Group]]:
 
 def _group_faults(group: h5py.Group, name: str) -> Found:
     positions, orientations = (read_array(group, key).astype(np.float64) for key in ("position", "orientation"))
-    gain, some = _scaled(group, "gain")
+    gain = group.get("gain")
+    if not isinstance(gain, h5py.Dataset):
+        raise DataError(f"{group.file.filename}: expected the dataset '{group.name}/gain'; it is missing")
     counts = {"position": len(positions), "orientation": len(orientations), "gain": len(gain)}
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"{count} of {key}" for key, count in counts.items())
         yield f"{name}: counts differ: {listed}", "Write one pose per spectrum"
         return
     yield from _pose_faults(positions, orientations, name)
-    yield from _gain_faults(gain, some, name)
-    yield from _unit_faults(group, name)
+    survey = survey_of(group)
+    yield from _gain_faults(survey, name)
+    yield from _unit_faults(group, name, survey)
 
 
-def _unit_faults(group: h5py.Group, name: str) -> Found:
+def _unit_faults(group: h5py.Group, name: str, survey: Survey) -> Found:
     """Values that no spectrum has in the units of the file."""
-    gain, some = _scaled(group, "gain")
-    if some.any():
-        peak, least = float(gain[some].max()), float(gain[some].min())
+    if not np.isnan(survey.gain).all():
+        peak, least = float(np.nanmax(survey.gain)), float(np.nanmin(survey.gain))
         if peak > MAX_GAIN_DB:
             what = f"{name}: the gain reaches {peak:.1f} dB, which no path gain does"
             yield what, "It is a level in dBm or another unit; subtract the transmit power and store dB"
@@ -84,7 +91,7 @@ def _unit_faults(group: h5py.Group, name: str) -> Found:
         )
     positions = read_array(group, "position").astype(np.float64)
     if np.isfinite(positions).all():
-        yield from _scale_faults(group, positions, some, name)
+        yield from _scale_faults(group, positions, survey, name)
 
 
 def _pose_faults(positions: np.ndarray, orientations: np.ndarray, name: str) -> Found:
@@ -109,56 +116,41 @@ def _pose_faults(positions: np.ndarray, orientations: np.ndarray, name: str) -> 
         return
 
 
-def _gain_faults(gain: np.ndarray, some: np.ndarray, name: str) -> Found:
-    flat, known = gain.reshape(len(gain), -1), some.reshape(len(some), -1)
-    empty = np.flatnonzero(~known.any(1))
-    if len(empty):
+def _gain_faults(survey: Survey, name: str) -> Found:
+    dark = np.isnan(survey.gain).any(1)
+    if dark.any():
+        empty = survey.index[dark]
         yield f"{name}: spectrum {_some(empty)} is empty, no power arrives", "Remove it, or trace that receiver again"
-    low = np.where(known, flat, np.inf).min(1, initial=np.inf)
-    high = np.where(known, flat, -np.inf).max(1, initial=-np.inf)
-    constant = np.flatnonzero(known.all(1) & (high - low < 1e-6))
+    constant = survey.index[survey.full & (survey.gain[:, 1] - survey.gain[:, 0] < 1e-6)]
     if len(constant):
         what = f"{name}: spectrum {_some(constant)} is constant, the same in every direction"
         yield what, "Remove it, or measure or trace it again"
 
 
-def _scale_faults(group: h5py.Group, positions: np.ndarray, some: np.ndarray, name: str) -> Found:
+def _scale_faults(group: h5py.Group, positions: np.ndarray, survey: Survey, name: str) -> Found:
     """Positions against delays: light needs distance / c at least."""
     metres = "Positions must be in metres and delays in seconds; convert and write them again"
-    first = None
-    if "delay" in group:
-        delay, known = _scaled(group, "delay")
-        known = known & some
-        if known.any() and float(delay[known].max()) > LONGEST_DELAY:
-            yield f"{name}: delays reach {float(delay[known].max()):.3g} s, the way of light over 300 km", metres
+    delay = survey.delay
+    if delay is not None and not np.isnan(delay).all():
+        first, last = float(np.nanmin(delay)), float(np.nanmax(delay))
+        if last > LONGEST_DELAY:
+            yield f"{name}: delays reach {last:.3g} s, the way of light over 300 km", metres
             return
-        if known.any() and float(delay[known].min()) < 0.0:
-            yield f"{name}: delays are negative, down to {float(delay[known].min()):.3g} s", metres
+        if first < 0.0:
+            yield f"{name}: delays are negative, down to {first:.3g} s", metres
             return
-        first = np.where(known, delay, np.inf).reshape(len(delay), -1).min(1, initial=np.inf)
-    if first is not None and "tx_position" in group:
-        distance = np.linalg.norm(positions - read_array(group, "tx_position").reshape(-1, 3)[:1], axis=1)
-        early = np.flatnonzero(np.isfinite(first) & (first < shortest_delay(distance)))
+    if delay is not None and "tx_position" in group:
+        tx = read_array(group, "tx_position").reshape(-1, 3)[:1]
+        distance = np.linalg.norm(positions[survey.index] - tx, axis=1)
+        early = np.flatnonzero(delay[:, 0] < shortest_delay(distance))
         if len(early):
             index = early[0]
-            yield (
-                f"{name}: spectrum {_some(early)} arrives before light could: {first[index]:.3g} s for "
-                f"{distance[index]:.4g} m from the transmitter",
-                metres,
-            )
+            needed = f"{delay[index, 0]:.3g} s for {distance[index]:.4g} m from the transmitter"
+            yield f"{name}: spectrum {_some(survey.index[early])} arrives before light could: {needed}", metres
         return
     extent = float(np.ptp(positions, axis=0).max()) if len(positions) else 0.0
     if extent > MAX_EXTENT:
         yield f"{name}: positions span {extent:.4g} m, more than {MAX_EXTENT:.0f} m; are they millimetres?", metres
-
-
-def _scaled(group: h5py.Group, name: str) -> tuple[np.ndarray, np.ndarray]:
-    codes = read_array(group, name)
-    item = group[name]
-    scale, offset, missing = (
-        np.float64(np.asarray(read_attribute(item, key))) for key in ("scale", "offset", "missing")
-    )
-    return codes * scale + offset, codes != missing
 
 
 def _some(indices: np.ndarray) -> str:

@@ -27,11 +27,13 @@ if TYPE_CHECKING:
     from rf3dgs.spectra.spectrum import Instrument as Instrument
     from rf3dgs.spectra.spectrum import Spectrum as Spectrum
     from rf3dgs.spectra.synthesis import default_lobe as default_lobe
+    from rf3dgs.spectra.yaws import at_yaws as at_yaws
 
 _HOMES = {
     "Spectrum": ".spectrum",
     "Instrument": ".spectrum",
     "spectrum_of": ".scan",
+    "at_yaws": ".yaws",
     "default_lobe": ".synthesis",
     "array_instrument": ".scan",
     "covariance_of": ".covariance",
@@ -56,6 +58,7 @@ __all__ = [  # noqa: RUF022 (reading order)
     "Spectrum",
     "Instrument",
     "spectrum_of",
+    "at_yaws",
     "default_lobe",
     "array_instrument",
     "covariance_of",

@@ -19,7 +19,8 @@ from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.files import atomic_file, atomic_folder
 from rf3dgs.data.dataset import Dataset
 from rf3dgs.data.formats.nerfstudio import FILE_NAME, read_nerfstudio, write_nerfstudio
-from rf3dgs.data.formats.spectra_h5 import Precision, read_spectra, write_spectra
+from rf3dgs.data.formats.spectra_codes import Precision
+from rf3dgs.data.formats.spectra_h5 import read_spectra, write_spectra
 from rf3dgs.data.photo import Photo
 from rf3dgs.data.safe import PICTURE_SUFFIXES, read_json, sha256_of, write_json
 
@@ -46,16 +47,19 @@ def save_native(dataset: Dataset, path: Path, precision: Precision | None = None
     """
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         with atomic_folder(path) as folder:
-            _write(dataset, folder, precision or Precision())
+            _write(dataset, folder, precision)
         return
     if not path.is_dir():
         raise DataError(f"{path} is a file, but a dataset is a folder; remove it or choose another name")
     (path / MANIFEST).unlink(missing_ok=True)
-    _write(dataset, path, precision or Precision())
+    _write(dataset, path, precision)
 
 
 def load_native(path: Path, *, unseal_test: bool = False) -> Dataset:
-    """Read a dataset folder; the spectra are checked against their sha256, photos when `validate` is asked."""
+    """Open a dataset folder; the spectra are checked against their sha256, photos when `validate` is asked.
+
+    Values of spectra stay in the file until they are asked for (`StoredSpectra`).
+    """
     manifest = read_manifest(path)
     file = path / MANIFEST
     spectra = repeat = index = None
@@ -130,7 +134,7 @@ def check_sha256(path: Path, expected: str) -> None:
         )
 
 
-def _write(dataset: Dataset, folder: Path, precision: Precision) -> None:
+def _write(dataset: Dataset, folder: Path, precision: Precision | None) -> None:
     spectra, repeat = dataset._spectra, dataset._repeat
     manifest: dict[str, Any] = {"schema": SCHEMA, "version": VERSION, **CONVENTIONS}
     manifest["spectra"] = manifest["photos"] = None

@@ -1,0 +1,158 @@
+"""`rf3dgs spectra`: receiver by receiver, in flat memory, going on where it was killed; and the paper's protocol."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from rf3dgs.channel.io import PathsReader, PathsWriter
+from rf3dgs.cli.main import main
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import equirect_grid
+from rf3dgs.core.units import SPEED_OF_LIGHT
+from rf3dgs.data.dataset import Dataset
+from rf3dgs.spectra.scan import spectrum_of
+
+ROOM = ((0, 0, 1), (14, 15, 2))
+
+
+@pytest.fixture
+def write_paths(tmp_path, random_paths):
+    """Paths to receivers scattered in a room, in a file."""
+
+    def write(count: int, each: int = 30) -> Path:
+        file = tmp_path / f"{count}-{each}.paths"
+        rx = Pose.scatter(ROOM, count, seed=1)
+        first = random_paths(each)
+        with PathsWriter(file, first.frequency, first.tx) as writer:
+            for number in range(count):
+                paths = random_paths(each, seed=number, rx=rx[number])
+                flight = float(torch.linalg.vector_norm(rx[number].position - first.tx.position)) / SPEED_OF_LIGHT
+                writer.append(replace(paths, delay=paths.delay + flight))
+        return file
+
+    return write
+
+
+MAKE_AND_READ = """
+import resource, sys
+from rf3dgs.cli.main import main
+assert main(["spectra", *sys.argv[1:]]) == 0
+from rf3dgs.data import Dataset
+dataset = Dataset.load(sys.argv[3], unseal_test=True).split(seed=3)
+print(sum(float(one.power.max()) > 0 for one in dataset.spectra))
+assert main(["validate", sys.argv[3]]) == 0
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+"""
+
+
+def test_memory_does_not_grow_with_the_receivers(write_paths, tmp_path):
+    peaks = []
+    for count in (20, 180):
+        out = str(tmp_path / f"site-{count}")
+        command = [sys.executable, "-c", MAKE_AND_READ, str(write_paths(count)), "--out", out, "--size", "180", "90"]
+        said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+        assert said[1] == str(count), "making, opening, splitting, iterating and validating are in this process"
+        peaks.append(float(said[-1]))
+    held = 160 * 180 * 90 * 5 * 4 / 2**20
+    assert held > 49, "what 160 spectra take in memory [MB]"
+    assert peaks[1] - peaks[0] < 0.2 * held
+
+
+def test_the_stream_is_what_each_receiver_alone_gives(write_paths, tmp_path):
+    file = write_paths(12)
+    assert main(["spectra", str(file), "--out", str(tmp_path / "site"), "--size", "48", "24"]) == 0
+    stored = Dataset.load(tmp_path / "site", unseal_test=True).spectra
+    with PathsReader(file) as reader:
+        for number in range(12):
+            alone = spectrum_of(reader[number], None, equirect_grid(48, 24))
+            some = alone.power > 0
+            assert torch.equal(stored[number].power > 0, some)
+            assert float((stored[number].gain_db - alone.gain_db)[some].abs().max()) < 0.00251, "half a step"
+            assert float((stored[number].delay - alone.delay)[some].abs().max()) < 5.1e-12
+    assert sorted(item.name for item in tmp_path.iterdir()) == ["12-30.paths", "site"]
+
+
+def started(file: Path, out: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "rf3dgs", "spectra", str(file), "--out", str(out), "--size", "360", "180"]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_a_killed_run_goes_on_and_ends_byte_for_byte_as_one_that_was_not(write_paths, tmp_path):
+    file = write_paths(40)
+    process = started(file, tmp_path / "killed")
+    folder = tmp_path / ".killed.spectra"
+    deadline = time.monotonic() + 120
+    while not list(folder.glob("part-*.h5")) and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.005)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    finished = len(list(folder.glob("part-*.h5")))
+    assert finished > 0
+    assert not (tmp_path / "killed").exists()
+    assert main(["spectra", str(file), "--out", str(tmp_path / "calm"), "--size", "360", "180"]) == 0
+    again = started(file, tmp_path / "killed")
+    _, progress = again.communicate(timeout=120)
+    assert again.returncode == 0, progress
+    assert "spectra: 40/40" in progress
+    for name in ("spectra.h5", "dataset.json"):
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "calm" / name).read_bytes()
+    assert not folder.exists()
+
+
+def test_parts_of_other_settings_are_not_taken_over(write_paths, tmp_path, capsys):
+    file = write_paths(10)
+    folder = tmp_path / ".site.spectra"
+    folder.mkdir()
+    (folder / "mine.txt").write_text("mine")
+    assert main(["spectra", str(file), "--out", str(tmp_path / "site")]) == 2
+    assert "holds something else; remove it" in capsys.readouterr().err
+    assert (folder / "mine.txt").read_text() == "mine"
+    (folder / "mine.txt").unlink()
+    (folder / "run.json").write_text('{"settings": {"size": [9, 9]}, "paths": "other"}')
+    (folder / "part-0000000.h5").write_bytes(b"of another run")
+    assert main(["spectra", str(file), "--out", str(tmp_path / "site"), "--size", "48", "24"]) == 0
+    assert Dataset.load(tmp_path / "site").grid.shape == (24, 48)
+
+
+def test_the_papers_preset_gives_four_pictures_of_each_position_on_one_side(write_paths, tmp_path, capsys):
+    out = tmp_path / "site"
+    assert main(["spectra", str(write_paths(5, 100)), "--out", str(out), "--preset", "paper"]) == 0
+    assert "20 spectra of 300x200 at 5 positions" in capsys.readouterr().out
+    dataset = Dataset.load(out, unseal_test=True)
+    assert dataset.grid.kind == "pinhole"
+    assert dataset.grid.K is not None
+    assert float(dataset.grid.K[0, 0]) == pytest.approx(150.0)
+    assert dataset.places.tolist() == [number // 4 for number in range(20)]
+    forward = dataset.pose.world_from_device[:4, :, 0]
+    expected = torch.tensor([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
+    torch.testing.assert_close(forward, expected, atol=1e-6, rtol=0)
+    roles = [set(dataset.roles[start : start + 4]) for start in range(0, 20, 4)]
+    assert all(len(each) == 1 for each in roles)
+    assert sum(each == {"test"} for each in roles) == 1
+    assert dataset.roles.count("train") == 16
+    assert main(["validate", str(out)]) == 0
+
+
+def test_the_sphere_preset_and_a_region(write_paths, tmp_path):
+    command = ["spectra", str(write_paths(10)), "--out", str(tmp_path / "site"), "--preset", "sphere"]
+    assert main([*command, "--split", "region"]) == 0
+    dataset = Dataset.load(tmp_path / "site")
+    assert dataset.grid.kind == "equirect"
+    assert dataset.grid.shape == (180, 360)
+    assert dataset.roles.count("region") == 2
+    assert "test" not in dataset.roles
+
+
+def test_a_preset_and_what_it_sets_are_not_both_given(write_paths, tmp_path, capsys):
+    command = ["spectra", str(write_paths(10)), "--out", str(tmp_path / "site"), "--preset", "paper"]
+    assert main([*command, "--fov-deg", "60"]) == 2
+    assert "--preset paper sets --fov-deg as well; give one of the two" in capsys.readouterr().err
+    assert not (tmp_path / "site").exists()
