@@ -155,11 +155,10 @@ if importlib.util.find_spec("rf3dgs.spectra.sage") and importlib.util.find_spec(
     @pytest.mark.parametrize("suffix", [".h5", ".mat", ".csv"])
     def test_a_measurement_becomes_paths_through_sage(tmp_path, suffix):
         """A noise-free comb of one line of sight: its delay to a hundredth of the resolution, its gain to 0.1 dB."""
-        from rf3dgs.channel.sounding import Sounding
-        from rf3dgs.propagation.measured import write_sounding
-
         from rf3dgs.channel.arrays import planar_array
         from rf3dgs.channel.response import cfr
+        from rf3dgs.channel.sounding import Sounding
+        from rf3dgs.propagation.measured import write_sounding
 
         array = planar_array(3, 3, "isotropic")
         rx = Pose.look_at(RX.position[:1], TX.position)

@@ -36,7 +36,7 @@ def said(capsys, *arguments) -> str:
 def test_a_material_without_values_at_the_frequency_names_its_object(site, capsys, tmp_path):
     with pytest.raises(InputError, match=r"object 'floor.*' has the material 'floorboard', .* at 10 GHz; use one of"):
         sionna.trace_each(site, None, RX, CONFIG, frequency=10e9)
-    told = said(capsys, "trace", "lobby", "--rx-count", 1, "--trace.frequency", 10e9, "--out", tmp_path / "a.paths")
+    told = said(capsys, "trace", "lobby", "--rx.count", 1, "--trace.frequency", 10e9, "--out", tmp_path / "a.paths")
     assert "which ITU-R P.2040 does not define at 10 GHz" in told
     assert not list(tmp_path.iterdir())
     with pytest.raises(InputError, match=r"wall 'z low' has the material 'floorboard', .* at 10 GHz"):
@@ -99,7 +99,7 @@ OLD = [path for path in sorted(Path("/usr/lib/x86_64-linux-gnu").glob("libLLVM-1
 @pytest.mark.parametrize("library", [*OLD, Path("/nonexistent/libLLVM.so")], ids=lambda path: path.name)
 def test_the_command_line_survives_a_chosen_llvm_that_does_not_work(library, tmp_path):
     """The command says so and leaves nothing; an old library counts where this machine has one."""
-    command = [sys.executable, "-m", "rf3dgs", "trace", "lobby", "--rx-count", "1", "--out", str(tmp_path / "a.paths")]
+    command = [sys.executable, "-m", "rf3dgs", "trace", "lobby", "--rx.count", "1", "--out", str(tmp_path / "a.paths")]
     environment = {**os.environ, llvm.VARIABLE: str(library)}
     run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert run.returncode == 2

@@ -21,10 +21,10 @@ from rf3dgs.core.grids import Camera, pinhole_grid
 from rf3dgs.propagation.config import PhotoConfig, TraceConfig
 from rf3dgs.propagation.jobs import run_job
 from rf3dgs.propagation.photo_job import PhotoJob, Shot, take
+from rf3dgs.propagation.presets import PRESETS
 from rf3dgs.propagation.scenes import scene_of
 from rf3dgs.propagation.toolchain import fingerprint, toolchain
 from rf3dgs.propagation.trace_job import TraceJob
-from rf3dgs.propagation.trace_presets import TRACE_PRESETS
 
 QUICK = TraceConfig(rays=3000, depth=2)
 
@@ -100,8 +100,8 @@ def test_a_receiver_in_the_wrong_place_is_named_by_its_own_number(box, tmp_path)
 
 
 def test_the_papers_preset_is_its_set():
-    paper = TRACE_PRESETS["paper"]
-    assert (paper.rx_count, paper.trace.depth, paper.min_paths) == (800, 3, 300_000)
+    paper, config = PRESETS["paper"], PRESETS["paper"].applied(scene_of("lobby"))[1]
+    assert (paper.rx_count, config.depth, paper.min_paths, config.frequency) == (800, 3, 300_000, 60e9)
 
 
 def test_the_toolchain_names_versions_llvm_and_processor(tracer):
@@ -152,7 +152,7 @@ def trace_command(out, *options):
 
 @pytest.mark.slow
 def test_a_trace_killed_twenty_times_ends_with_the_bytes_of_a_calm_one(tracer, tmp_path):
-    what = ("--rx-count", 120, "--shard-size", 3, "--trace.rays", 30_000)
+    what = ("--rx.count", 120, "--shard-size", 3, "--trace.rays", 30_000)
     subprocess.run(trace_command(tmp_path / "calm", *what), check=True)
     out, generator = tmp_path / "killed", random.Random(5)
     for _ in range(20):
@@ -174,7 +174,7 @@ def test_a_trace_killed_twenty_times_ends_with_the_bytes_of_a_calm_one(tracer, t
 def test_two_workers_one_of_them_killed_make_the_bytes_of_one_process(tracer, tmp_path):
     psutil = pytest.importorskip("psutil")
     pytest.importorskip("distributed")
-    what = ("--rx-count", 200, "--shard-size", 5, "--trace.rays", 30_000)
+    what = ("--rx.count", 200, "--shard-size", 5, "--trace.rays", 30_000)
     subprocess.run(trace_command(tmp_path / "calm", *what), check=True)
     process = subprocess.Popen(trace_command(tmp_path / "shared", *what, "--workers", 2))
     wait_for(lambda: (tmp_path / "shared" / "00004.h5").exists(), 120)

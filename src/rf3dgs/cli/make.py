@@ -1,7 +1,7 @@
 """`trace` and `photos`: from a scene to its paths and its photographs."""
 
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -9,13 +9,12 @@ import tyro
 
 from rf3dgs.cli.show import console, out
 from rf3dgs.core.errors import InputError
-from rf3dgs.propagation.config import PhotoConfig, TraceConfig
+from rf3dgs.propagation.config import PhotoConfig, ReceiverConfig, TraceConfig
 
 if TYPE_CHECKING:
     from rf3dgs.propagation.jobs import Crew
 
-RX_COUNT = 72
-"""Receivers that `trace` places unless a number or a preset is given."""
+Preset = Literal["paper", "diffuse", "realistic", "28ghz", "10ghz", "2.4ghz", "transparent"]
 
 
 @dataclass(frozen=True)
@@ -23,15 +22,15 @@ class Trace:
     """Trace the paths from the transmitter to many receivers with Sionna RT; a killed run goes on where it stopped."""
 
     scene: tyro.conf.Positional[str]
-    """"lobby", a scene that ships with Sionna RT ("box", "simple_street_canyon"), or a Sionna/Mitsuba XML file."""
-    rx_count: int | None = None
-    """Receivers, drawn in the free space of the scene; the preset's number, or 72."""
-    rx_seed: int = 0
-    """Decides where the receivers stand."""
+    """"lobby", "lobby-full" (more furniture), a scene that ships with Sionna RT ("box", "simple_street_canyon"), a
+    Sionna/Mitsuba XML file, or a folder of meshes."""
     out: Path = Path("lobby.paths")
     """The folder to write: a manifest and shards in HDF5; the same command again makes what is missing."""
-    preset: Literal["paper"] | None = None
-    """"paper": 800 receivers, depth 3, at least 300,000 paths each; instead of --trace.*"""
+    preset: Preset | None = None
+    """Frequency, scattering and what rays do, by name; the scene's own without. "paper" is "diffuse" for 800 receivers
+    with at least 300,000 paths each."""
+    rx: ReceiverConfig = field(default_factory=ReceiverConfig)
+    """Where receivers stand."""
     trace: TraceConfig = field(default_factory=TraceConfig)
     """How paths are traced."""
     shard_size: int = 25
@@ -46,22 +45,27 @@ class Trace:
         from rf3dgs.channel.io import PathsReader
         from rf3dgs.cli.facts import open_scene
         from rf3dgs.propagation.jobs import run_job
+        from rf3dgs.propagation.presets import preset_of
+        from rf3dgs.propagation.receivers import receivers_of
+        from rf3dgs.propagation.scene import without_looks
         from rf3dgs.propagation.trace_job import TraceJob
-        from rf3dgs.propagation.trace_presets import TRACE_PRESETS
 
-        preset = TRACE_PRESETS[self.preset] if self.preset else None
-        config = _chosen_trace(self.preset, preset.trace, self.trace) if preset else self.trace
-        count = self.rx_count if self.rx_count is not None else preset.rx_count if preset else RX_COUNT
-        _at_least_one(("--rx-count", count), ("--shard-size", self.shard_size), ("--workers", self.workers))
+        _at_least_one(("--shard-size", self.shard_size), ("--workers", self.workers))
         crew = _crew(self.workers, self.cluster)
-        scene = open_scene(self.scene)
+        scene, config, preset = open_scene(self.scene), self.trace, None
+        where = self.rx
+        if self.preset is not None:
+            preset = preset_of(self.preset)
+            scene, config = preset.applied(scene, config)
+            where = replace(where, count=where.count or preset.rx_count)
+        rx = receivers_of(scene, where)
         job = TraceJob(
-            scene=self.scene,
+            scene=self.scene if preset is None else without_looks(scene),
             tx=scene.tx,
-            rx=scene.receivers(count, self.rx_seed),
+            rx=rx,
             frequency=config.frequency or scene.frequency,
             config=config,
-            rule={"how": "drawn in free space", "seed": self.rx_seed},
+            rule=asdict(where),
             min_paths=preset.min_paths if preset else 0,
             shard_size=self.shard_size,
         )
@@ -70,7 +74,7 @@ class Trace:
             traced = reader.traced
         size = sum(item.stat().st_size for item in self.out.iterdir())
         least = "" if traced is None else f", at least {int(traced.min()):,} paths each before diffuse ones are merged"
-        out(f"{self.out}: {count} receivers{least}, {size / 1e6:.1f} MB")
+        out(f"{self.out}: {len(rx)} receivers{least}, {size / 1e6:.1f} MB")
         return 0
 
 
@@ -79,7 +83,9 @@ class MakePhotos:
     """Render posed photographs of a scene with Mitsuba, in nerfstudio's layout; a killed run goes on."""
 
     scene: tyro.conf.Positional[str]
-    """"lobby", a scene that ships with Sionna RT, or a Sionna/Mitsuba XML file."""
+    """"lobby", "lobby-full", a scene that ships with Sionna RT, a Sionna/Mitsuba XML file, or a folder of meshes."""
+    preset: Preset | None = None
+    """As of trace: some presets change what stands in the scene, and how it looks."""
     count: int = 60
     """Photographs."""
     tour_seed: int = 0
@@ -102,12 +108,16 @@ class MakePhotos:
         from rf3dgs.data.formats.nerfstudio import write_nerfstudio
         from rf3dgs.propagation.jobs import run_job
         from rf3dgs.propagation.photo_job import PhotoJob
+        from rf3dgs.propagation.presets import preset_of
 
         _at_least_one(("--count", self.count), ("--shard-size", self.shard_size), ("--workers", self.workers))
         crew = _crew(self.workers, self.cluster)
-        shots = shots_of_tour(open_scene(self.scene), self.count, self.tour_seed, self.photo)
+        scene = open_scene(self.scene)
+        if self.preset is not None:
+            scene, _ = preset_of(self.preset).applied(scene)
+        shots = shots_of_tour(scene, self.count, self.tour_seed, self.photo)
         rule = {"how": "a walk", "seed": self.tour_seed}
-        job = PhotoJob(self.scene, shots, rule, self.shard_size)
+        job = PhotoJob(scene if self.preset else self.scene, shots, rule, self.shard_size)
         run_job(job, self.out, crew=crew, progress=console())
         write_nerfstudio(self.out, photos_of(shots, self.out))
         out(f"{self.out}: {self.count} photographs of {self.photo.width}x{self.photo.height}")
@@ -118,14 +128,6 @@ def _at_least_one(*options: tuple[str, int]) -> None:
     for name, value in options:
         if value < 1:
             raise InputError(f"{name} must be at least 1; got {value}")
-
-
-def _chosen_trace(name: str | None, preset: TraceConfig, given: TraceConfig) -> TraceConfig:
-    """The preset with the seed and the frequency given; InputError where both say something else."""
-    chosen = {"seed": given.seed, "frequency": given.frequency}
-    if given != TraceConfig(**chosen):
-        raise InputError(f"--preset {name} sets how paths are traced; give it or --trace.*, not both")
-    return replace(preset, **chosen)
 
 
 def _crew(workers: int, cluster: str | None) -> "AbstractContextManager[Crew] | None":

@@ -40,8 +40,8 @@ class ReceiverConfig:
 
     kind: Literal["random", "grid", "route"] = "random"
     """Drawn uniformly in the free space, on a regular grid in it, or along a walked route."""
-    count: int = 72
-    """How many are drawn; random only."""
+    count: int | None = None
+    """How many are drawn, 72 unless given; random only."""
     seed: int = 0
     """Decides where they are drawn; random only."""
     spacing: float = 0.5

@@ -19,8 +19,8 @@ FOLIAGE_SCATTERING = 0.96
 
 @dataclass(frozen=True)
 class Preset:
-    """What a name stands for: `frequency` [Hz], whether rays pass through walls or bend round edges, and how objects
-    are changed."""
+    """What a name stands for: `frequency` [Hz], whether rays pass through walls or bend round edges, how objects are
+    changed, and where it is a whole set, how many receivers and how many paths each at least, before binning."""
 
     name: str
     summary: str
@@ -28,6 +28,8 @@ class Preset:
     change: Callable[[Scene], Scene]
     refraction: bool = False
     diffraction: bool = False
+    rx_count: int | None = None
+    min_paths: int = 0
 
     def applied(self, scene: Scene, config: TraceConfig | None = None) -> tuple[Scene, TraceConfig]:
         """The scene and the configuration under this preset; what the configuration says otherwise stays.
@@ -93,6 +95,7 @@ def _transparent(scene: Scene) -> Scene:
 PRESETS = {
     preset.name: preset
     for preset in (
+        Preset("paper", "diffuse, for 800 receivers", 60e9, _diffuse, rx_count=800, min_paths=300_000),
         Preset("diffuse", "60 GHz, every surface scatters by Lambert's law, as in the paper", 60e9, _diffuse),
         Preset("realistic", "60 GHz, directive lobes, mirrors of glass, metal and polished stone", 60e9, _realistic),
         Preset("28ghz", "28 GHz, as realistic", 28e9, _realistic),

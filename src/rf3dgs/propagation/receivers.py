@@ -10,6 +10,8 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.propagation.config import ReceiverConfig
 from rf3dgs.propagation.scene import Bounds, Scene
 
+COUNT = 72
+"""Receivers that are drawn unless a number is given."""
 MOST = 1_000_000
 """Largest number of places that are looked at."""
 
@@ -23,26 +25,27 @@ def receivers_of(scene: Scene, config: ReceiverConfig | None = None) -> Pose:
     closer to an object than the clearance, naming both.
     """
     config = ReceiverConfig() if config is None else config
-    _check(config)
+    count = COUNT if config.count is None else config.count
+    _check(config, count)
     if config.kind == "route":
         return _walked(scene, config)
     bounds = _at_height(scene.rx_bounds, config.height)
     if config.kind == "grid":
         return Pose(_grid(scene, bounds, config))
-    return Pose(scene.free_points(bounds, config.count, config.seed, clearance=config.clearance))
+    return Pose(scene.free_points(bounds, count, config.seed, clearance=config.clearance))
 
 
-def _check(config: ReceiverConfig) -> None:
+def _check(config: ReceiverConfig, count: int) -> None:
     if config.kind not in ("random", "grid", "route"):
         raise InputError(f'receivers are "random", on a "grid" or on a "route"; got {config.kind!r}')
     for name in ("spacing", "speed", "interval"):
         value = getattr(config, name)
         if not 0.0 < value < math.inf:
             raise InputError(f"receivers need a positive {name}; got {value}")
-    if not 0.0 <= config.clearance < math.inf or not 1 <= config.count <= MOST:
+    if not 0.0 <= config.clearance < math.inf or not 1 <= count <= MOST:
         raise InputError(
             f"receivers need a clearance of at least 0 m and a count from 1 to {MOST}; "
-            f"got {config.clearance} and {config.count}"
+            f"got {config.clearance} and {count}"
         )
 
 

@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -191,3 +191,8 @@ class Scene:
     def size(self) -> float:
         """The diagonal of the bounds [m]."""
         return math.dist(*self.bounds)
+
+
+def without_looks(scene: Scene) -> Scene:
+    """The scene as radio sees it: objects without textures, which are most of its bytes."""
+    return replace(scene, objects=tuple(replace(item, texture=None, uv=None) for item in scene.objects))
