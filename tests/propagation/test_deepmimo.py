@@ -188,6 +188,12 @@ def test_azimuths_of_a_full_turn_are_wrapped(folder):
     assert float(back.aoa_azimuth.abs().max()) <= math.pi + 1e-6
 
 
+def test_a_transmitter_may_be_a_row_or_a_triple(folder):
+    """DeepMIMO's converters write either."""
+    replace_matrix(folder, "tx_pos", lambda array: array.reshape(3))
+    assert torch.equal(read_deepmimo(folder).tx.position, TX.position)
+
+
 def test_one_of_several_pairs_is_chosen_by_name(folder):
     for file in list(folder.glob(f"*_{PAIR}.npz")):
         (folder / file.name.replace(PAIR, "t000_tx001_r001")).write_bytes(file.read_bytes())
