@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.units import wavelength
+from rf3dgs.core.units import friis_gain, wavelength
 from rf3dgs.propagation import shapes
 from rf3dgs.propagation.config import TraceConfig
 from rf3dgs.propagation.llvm import find_llvm
@@ -31,7 +31,7 @@ FREQUENCY = 28e9
 TX, RX = Pose((-1.0, -0.5, 2.0)), Pose([[1.2, 0.8, 1.5]])
 MATERIAL, SIDE, ROUGHNESS = "concrete", 6.0, 0.6
 SEEDS = 16
-DIFFUSE = 2
+SPECULAR, DIFFUSE = 1, 2  # bits of Paths.kind
 # With mirrors enabled a ray draws its fate, so that each seed is a sample; without, every ray scatters.
 DRAWN = TraceConfig(rays=50_000, depth=1, line_of_sight=False)
 
@@ -94,3 +94,17 @@ def test_without_chance_the_rays_lattice_integrates_the_plate(diffuse_power):
 def test_diffuse_power_grows_with_the_square_of_the_scattering_amplitude(diffuse_power, roughness):
     power = diffuse_power(replace(DRAWN, specular=False), roughness)
     assert power == pytest.approx(integral(roughness), rel=1e-3)
+
+
+def test_the_mirror_keeps_what_is_not_scattered(diffuse_power):
+    """Friis over the distance of the image times R (1 - S^2): with what scatters, all of R is accounted for."""
+    from rf3dgs.propagation.sionna import trace_each
+
+    (row,) = trace_each(plate(ROUGHNESS), TX, RX, DRAWN)
+    image = TX.position.double() * torch.tensor([1.0, 1.0, -1.0])
+    line = RX.position[0].double() - image
+    te, tm = slab_reflection(Slab(*permittivity(MATERIAL, FREQUENCY), THICKNESS), line[2] / line.norm(), FREQUENCY)
+    reflectance = 0.5 * float(te.abs() ** 2 + tm.abs() ** 2)
+    expected = float(friis_gain(line.norm(), FREQUENCY)) * reflectance * (1 - ROUGHNESS**2)
+    assert row.kind is not None
+    assert float(row.path_gain[row.kind == SPECULAR]) == pytest.approx(expected, rel=1e-4)
