@@ -72,7 +72,7 @@ def diffuse_power():
 def test_diffuse_power_is_the_integral_within_monte_carlo_error(diffuse_power):
     """A z-test: with 16 seeds, which are fixed, Student's t of a sound tracer exceeds 4 once in 900 choices of them.
 
-    The standard error is about 0.6 %, so that the models next to the right one (power spread evenly over the
+    The standard error is about 0.4 %, so that the models next to the right one (power spread evenly over the
     hemisphere, S for S^2, polarisations added instead of averaged) are far outside.
     """
     drawn = torch.tensor([diffuse_power(replace(DRAWN, seed=7919 * seed)) for seed in range(SEEDS)])
