@@ -60,6 +60,8 @@ def test_paths_go_to_hdf5_and_back_bit_for_bit(source, tmp_path):
     sent, back = load_paths(source), load_paths(tmp_path / "back.paths")
     for name in ("coeff", "delay", "aoa_zenith", "aod_azimuth", "order", "kind"):
         assert torch.equal(getattr(back, name), getattr(sent, name)), name
+    with PathsReader(tmp_path / "back.paths") as reader:
+        assert reader.meta == {"scene": "room", "imported": "paths", "from": "room.h5"}
 
 
 def test_a_reader_of_ones_own_is_not_replaced(source, tmp_path):

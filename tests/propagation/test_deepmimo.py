@@ -1,5 +1,6 @@
 """DeepMIMO v4 folders: what is written comes back, and what cannot be is refused in one sentence."""
 
+import errno
 import json
 import math
 import zipfile
@@ -15,6 +16,7 @@ from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.units import SPEED_OF_LIGHT
+from rf3dgs.propagation import deepmimo_write
 from rf3dgs.propagation.deepmimo import SIONNA, deepmimo_pairs, read_deepmimo
 from rf3dgs.propagation.deepmimo_write import PAIR, write_deepmimo
 from rf3dgs.propagation.room import shoebox
@@ -188,6 +190,12 @@ def test_azimuths_of_a_full_turn_are_wrapped(folder):
     assert float(back.aoa_azimuth.abs().max()) <= math.pi + 1e-6
 
 
+def test_a_transmitter_may_be_a_row_or_a_triple(folder):
+    """DeepMIMO's converters write either."""
+    replace_matrix(folder, "tx_pos", lambda array: array.reshape(3))
+    assert torch.equal(read_deepmimo(folder).tx.position, TX.position)
+
+
 def test_one_of_several_pairs_is_chosen_by_name(folder):
     for file in list(folder.glob(f"*_{PAIR}.npz")):
         (folder / file.name.replace(PAIR, "t000_tx001_r001")).write_bytes(file.read_bytes())
@@ -318,3 +326,19 @@ def test_a_zip_bomb_is_refused_before_it_is_read(folder):
         DataError, match=r"declares 300000128 bytes, more than the \d+ that a file of its size may hold"
     ):
         read_deepmimo(folder)
+
+
+def test_a_disk_that_fills_up_leaves_the_older_scenario(paths, folder, monkeypatch):
+    before = {item.name: item.read_bytes() for item in folder.iterdir()}
+    save = deepmimo_write._save
+
+    def fail(path, name, matrix):
+        if name == "inter":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        save(path, name, matrix)
+
+    monkeypatch.setattr(deepmimo_write, "_save", fail)
+    with pytest.raises(DataError, match=r"cannot write .*site: No space left on device; free space or choose another"):
+        write_deepmimo(folder, paths[:1])
+    assert {item.name: item.read_bytes() for item in folder.iterdir()} == before
+    assert [item.name for item in folder.parent.iterdir()] == ["site"]

@@ -48,25 +48,24 @@ class Import:
                 what = "DeepMIMO folders" if owner == "deepmimo" else "measured soundings"
                 raise InputError(f"--{name} is for {what}; {self.source} is none")
         with ExitStack() as stack:
-            rows, total = self._rows(kind, stack)
+            rows, total, meta = self._rows(kind, stack)
             progress = track(rows, "import", total, console())
             first = next(progress)
-            with PathsWriter(
-                self.out, first.frequency, first.tx, {"imported": kind, "from": self.source.name}
-            ) as writer:
+            meta = {**meta, "imported": kind, "from": self.source.name}
+            with PathsWriter(self.out, first.frequency, first.tx, meta) as writer:
                 writer.append(first)
                 for row in progress:
                     writer.append(row)
         out(f"{self.out}: {total} receivers, {self.out.stat().st_size / 1e6:.1f} MB")
         return 0
 
-    def _rows(self, kind: Kind, stack: ExitStack) -> "tuple[Iterator[Paths], int]":
-        """The paths of one receiver after the other, and how many there are."""
+    def _rows(self, kind: Kind, stack: ExitStack) -> "tuple[Iterator[Paths], int, dict]":
+        """The paths of one receiver after the other, how many there are, and what the source says of itself."""
         if kind == "paths":
             from rf3dgs.channel.io import PathsReader
 
             reader = stack.enter_context(PathsReader(self.source))
-            return iter(reader), len(reader)
+            return iter(reader), len(reader), reader.meta
         if kind == "deepmimo":
             from rf3dgs.propagation.deepmimo import read_deepmimo
 
@@ -76,7 +75,7 @@ class Import:
             from rf3dgs.spectra.sage import sage  # pyright: ignore[reportMissingImports]
 
             paths = sage(read_sounding(self.source), self.count, progress=console()).flat()
-        return (paths[index] for index in range(len(paths.rx))), len(paths.rx)
+        return (paths[index] for index in range(len(paths.rx))), len(paths.rx), {}
 
 
 @dataclass(frozen=True)

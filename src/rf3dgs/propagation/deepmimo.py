@@ -236,7 +236,10 @@ def _interactions(folder: Path, code: str, valid: NDArray) -> tuple[torch.Tensor
         bits = np.select([rest % 10 == digit for digit in DIGITS], list(DIGITS.values()), default=0).astype(np.int8)
         if (exact & (bits == 0)).any():
             wrong = given[exact & (bits == 0)][0]
-            raise DataError(f"{path}: the interaction code {wrong:.0f} has digits other than 1 to 4; it is damaged")
+            raise DataError(
+                f"{path}: the interaction code {wrong:.0f} has digits other than 1 to 4; it is damaged or was "
+                "converted before DeepMIMO 4.0.5, convert it again"
+            )
         order += here
         kind |= np.where(exact, bits, 0).astype(np.int8)
         rest //= 10

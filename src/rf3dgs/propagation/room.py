@@ -202,9 +202,8 @@ def _reflect(field: Tensor, direction: Tensor, wall: Tensor, coefficients: Tenso
 def _basis(direction: Tensor) -> tuple[Tensor, Tensor]:
     """Unit vectors of rising zenith (vertical polarisation) and of rising azimuth (horizontal), `[*batch, 3]`."""
     zenith, azimuth = angles_of(direction)
-    return direction_of(zenith + math.pi / 2, azimuth), direction_of(
-        torch.full_like(zenith, math.pi / 2), azimuth + math.pi / 2
-    )
+    level, right = torch.full_like(zenith, math.pi / 2), math.pi / 2
+    return direction_of(zenith + right, azimuth), direction_of(level, azimuth + right)
 
 
 def _room(size: Sequence[float]) -> Tensor:
