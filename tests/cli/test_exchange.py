@@ -1,6 +1,5 @@
 """`rf3dgs import` and `rf3dgs export`: round trips through every format, and one sentence for what cannot be."""
 
-import importlib.util
 import shutil
 from pathlib import Path
 
@@ -152,26 +151,24 @@ def test_an_older_file_stays_when_an_import_fails(source, tmp_path, capsys):
     assert target.read_bytes() == source.read_bytes()
 
 
-if importlib.util.find_spec("rf3dgs.spectra.sage") and importlib.util.find_spec("rf3dgs.propagation.measured"):
+@pytest.mark.parametrize("suffix", [".h5", ".mat", ".csv"])
+def test_a_measurement_becomes_paths_through_sage(tmp_path, suffix):
+    """A noise-free comb of one line of sight: its delay to a hundredth of the resolution, its gain to 0.1 dB."""
+    from rf3dgs.channel.arrays import planar_array
+    from rf3dgs.channel.response import cfr
+    from rf3dgs.channel.sounding import Sounding
+    from rf3dgs.propagation.measured import write_sounding
 
-    @pytest.mark.parametrize("suffix", [".h5", ".mat", ".csv"])
-    def test_a_measurement_becomes_paths_through_sage(tmp_path, suffix):
-        """A noise-free comb of one line of sight: its delay to a hundredth of the resolution, its gain to 0.1 dB."""
-        from rf3dgs.channel.arrays import planar_array
-        from rf3dgs.channel.response import cfr
-        from rf3dgs.channel.sounding import Sounding
-        from rf3dgs.propagation.measured import write_sounding
-
-        array = planar_array(3, 3, "isotropic")
-        rx = Pose.look_at(RX.position[:1], TX.position)
-        tx = Pose.look_at(TX.position, RX.position[0])
-        paths = shoebox(SIZE, tx, rx, FREQUENCY, 0)
-        offsets = (torch.arange(32, dtype=torch.float64) - 16) * 10e6
-        response = cfr(paths, array, array, offsets).to(torch.complex128)
-        sounding = Sounding(response, offsets, FREQUENCY, tx, rx, array_rx=array, array_tx=array)
-        write_sounding(tmp_path / f"measured{suffix}", sounding)
-        run("import", tmp_path / f"measured{suffix}", "--out", tmp_path / "found.paths", "--count", "1")
-        found = load_paths(tmp_path / "found.paths")
-        assert found.count.tolist() == [1]
-        assert float(found.delay[0, 0] - paths.delay[0, 0]) == pytest.approx(0, abs=0.01 / 320e6)
-        assert float(found.total_gain[0] / paths.total_gain[0]) == pytest.approx(1, abs=0.02)
+    array = planar_array(3, 3, "isotropic")
+    rx = Pose.look_at(RX.position[:1], TX.position)
+    tx = Pose.look_at(TX.position, RX.position[0])
+    paths = shoebox(SIZE, tx, rx, FREQUENCY, 0)
+    offsets = (torch.arange(32, dtype=torch.float64) - 16) * 10e6
+    response = cfr(paths, array, array, offsets).to(torch.complex128)
+    sounding = Sounding(response, offsets, FREQUENCY, tx, rx, array_rx=array, array_tx=array)
+    write_sounding(tmp_path / f"measured{suffix}", sounding)
+    run("import", tmp_path / f"measured{suffix}", "--out", tmp_path / "found.paths", "--count", "1")
+    found = load_paths(tmp_path / "found.paths")
+    assert found.count.tolist() == [1]
+    assert float(found.delay[0, 0] - paths.delay[0, 0]) == pytest.approx(0, abs=0.01 / 320e6)
+    assert float(found.total_gain[0] / paths.total_gain[0]) == pytest.approx(1, abs=0.02)

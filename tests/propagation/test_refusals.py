@@ -93,7 +93,7 @@ def test_tracing_without_llvm_is_one_error(site, monkeypatch):
         list(sionna.trace_each(site, None, RX, CONFIG))
 
 
-OLD = [path for path in sorted(Path("/usr/lib/x86_64-linux-gnu").glob("libLLVM-14.so")) if path.exists()]
+OLD = [path for path in sorted(Path("/usr/lib/x86_64-linux-gnu").glob("libLLVM-1[4-6].so")) if path.exists()]
 
 
 @pytest.mark.parametrize("library", [*OLD, Path("/nonexistent/libLLVM.so")], ids=lambda path: path.name)

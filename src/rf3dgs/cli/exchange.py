@@ -71,8 +71,8 @@ class Import:
 
             paths = read_deepmimo(self.source, self.pair)
         else:
-            from rf3dgs.propagation.measured import read_sounding  # pyright: ignore[reportMissingImports]
-            from rf3dgs.spectra.sage import sage  # pyright: ignore[reportMissingImports]
+            from rf3dgs.propagation.measured import read_sounding
+            from rf3dgs.spectra.sage import sage
 
             paths = sage(read_sounding(self.source), self.count, progress=console()).flat()
         return (paths[index] for index in range(len(paths.rx))), len(paths.rx), {}

@@ -1,7 +1,8 @@
 """Finds an LLVM that the ray tracer's compiler accepts, without risking this process.
 
-Dr.Jit loads LLVM at its first computation. It refuses version 14 and aborts the whole process with 15 and 16, so each
-candidate is tried in a process of its own first.
+Dr.Jit loads LLVM at its first computation. It refuses version 14; with 15 and 16 it computes small things, then aborts
+the whole process when a scene is traced. So each candidate is tried, and asked for its version, in a process of its
+own.
 """
 
 import os
@@ -37,6 +38,8 @@ import drjit as dr
 from drjit.llvm import Float
 x = dr.arange(Float, 8)
 assert dr.sum(x * x)[0] == 140.0
+version = dr.detail.llvm_version()
+assert version[0] >= 17, "this is LLVM %d.%d.%d" % version
 """
 
 
