@@ -4,8 +4,8 @@
 
 Paths are a million diffuse ones from all sides with delays of 20 to 100 ns, arrays 10x10 patches, pictures 300x200. The
 floor of a scan is one complex128 matrix product [direction, element] x [element, element], measured in turn with the
-scans; the floors of the others are not known. Musts: milliseconds of the clock on two cores, or ratios to the floor in
-CPU time.
+scans; the floors of the others are not known. Musts: ratios to the floor in CPU time, or milliseconds of the clock on two
+cores, judged by the CPU time of all threads, which the clock of a machine that does nothing else does not exceed.
 """
 
 import argparse
@@ -56,7 +56,7 @@ class Row:
     @property
     def verdict(self) -> str:
         if self.clock_must is not None:
-            return "met" if self.timing.wall_min <= self.clock_must else "not met"
+            return "met" if self.timing.cpu_min <= self.clock_must else "not met"
         if self.ratio_must is not None and self.ratio is not None:
             return "met" if self.ratio <= self.ratio_must else "not met"
         return ""
