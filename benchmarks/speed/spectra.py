@@ -4,8 +4,8 @@
 
 Paths are a million diffuse ones from all sides with delays of 20 to 100 ns, arrays 10x10 patches, pictures 300x200. The
 floor of a scan is one complex128 matrix product [direction, element] x [element, element], measured in turn with the
-scans; the floors of the others are not known. Musts: ratios to the floor in CPU time, or milliseconds of the clock on two
-cores, judged by the CPU time of all threads, which the clock of a machine that does nothing else does not exceed.
+scans; the floors of the others are not known. Musts: ratios to the floor in CPU time, or milliseconds of the clock on
+two cores, judged by the CPU time of all threads, which the clock of a machine that does nothing else does not exceed.
 """
 
 import argparse
