@@ -68,7 +68,8 @@ Fallen fall(float zenith, float azimuth, int rows, int columns, int fold) {
 constexpr int kTogether = 256;  // paths whose angles are found at once
 
 void fall_together(const float* directions, int count, int rows, int columns, int fold, Fallen* fallen) {
-  float x[kTogether], y[kTogether], z[kTogether], level[kTogether], zenith[kTogether], azimuth[kTogether];
+  float x[kTogether] = {}, y[kTogether] = {}, z[kTogether] = {}, level[kTogether] = {};
+  float zenith[kTogether], azimuth[kTogether];
   for (int at = 0; at < count; ++at) {
     x[at] = directions[3 * at];
     y[at] = directions[3 * at + 1];
