@@ -39,14 +39,19 @@ inline void centred_phasors(double phase, int count, double* real, double* imagi
   if (count % 2 == 1) imaginary[count / 2] = 0.0;
 }
 
-// Weights of the paths in the lines, by Horner's rule for all taps at once.
+// Weights of a path in the lines, by Horner's rule for all taps at once.
 inline void tap_weights(const double* polynomials, double fraction, double* weights) {
+  constexpr int kParts = kSpreadColumns / kDoubles;
   const double t = 2.0 * fraction - 1.0;
-  for (int tap = 0; tap < kSpreadColumns; ++tap) weights[tap] = polynomials[tap];
+  Doubles value[kParts];
+  for (int part = 0; part < kParts; ++part) value[part] = *reinterpret_cast<const Doubles*>(polynomials + part * kDoubles);
   for (int term = 1; term < kSpreadTerms; ++term) {
     const double* row = polynomials + term * kSpreadColumns;
-    for (int tap = 0; tap < kSpreadColumns; ++tap) weights[tap] = weights[tap] * t + row[tap];
+    for (int part = 0; part < kParts; ++part) {
+      value[part] = value[part] * t + *reinterpret_cast<const Doubles*>(row + part * kDoubles);
+    }
   }
+  for (int part = 0; part < kParts; ++part) *reinterpret_cast<Doubles*>(weights + part * kDoubles) = value[part];
 }
 
 void spread(const PathWaves& waves, const uint32_t* paths, int count, double cell, double* lines, double* scratch) {
@@ -60,6 +65,12 @@ void spread(const PathWaves& waves, const uint32_t* paths, int count, double cel
   double* const col_imaginary = col_real + cols;
   double* const responses = col_imaginary + cols;
   std::memset(row_real, 0, sizeof(double) * 2 * (rows + 8));
+  // Paths lie all over memory: ask for all of them before the first is needed.
+  for (int at = 0; at < count; ++at) {
+    __builtin_prefetch(waves.place + paths[at]);
+    __builtin_prefetch(waves.coeff + 2 * static_cast<size_t>(paths[at]));
+    __builtin_prefetch(waves.directions + 3 * static_cast<size_t>(paths[at]) + 1);
+  }
   for (int at = 0; at < count; ++at) {
     const size_t path = paths[at];
     tap_weights(waves.polynomials, waves.place[path] - cell, weights + at * kSpreadColumns);

@@ -51,6 +51,7 @@ void spread_responses(const PathWaves& waves, size_t count, int cells, double* t
   const int elements = waves.rows * waves.cols, line = spread_line(elements), padded = padded_elements(elements);
   const size_t lines = kBlock + kSpreadWidth - 1;
   std::vector<std::vector<double>> sums(pieces.size());
+  const SpectraKernels& kernel = spectra_kernels();
   parallel_for(static_cast<int>(pieces.size()), threads, [&](int index) {
     const Piece& piece = pieces[index];
     std::vector<double>& sum = sums[index];
@@ -61,8 +62,8 @@ void spread_responses(const PathWaves& waves, size_t count, int cells, double* t
       const size_t end = std::min(piece.end, start[cell + 1]);
       while (at < end) {
         const int group = static_cast<int>(std::min<size_t>(kSpreadGroup, end - at));
-        spectra_kernels().spread(waves, order.data() + at, group, cell,
-                                 sum.data() + static_cast<size_t>(cell - piece.first_cell) * line, scratch.data());
+        kernel.spread(waves, order.data() + at, group, cell,
+                      sum.data() + static_cast<size_t>(cell - piece.first_cell) * line, scratch.data());
         at += group;
       }
     }

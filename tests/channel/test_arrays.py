@@ -5,7 +5,8 @@ import torch
 
 from rf3dgs.channel.arrays import ofdm, planar_array
 from rf3dgs.channel.patterns import power_pattern
-from rf3dgs.channel.response import manifold
+from rf3dgs.channel.response import manifold, manifold_factors
+from rf3dgs.core.angles import direction_of
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import equirect_grid
 
@@ -61,3 +62,38 @@ def test_subcarriers_have_equal_spacing_and_hold_the_carrier():
     assert torch.allclose(offsets.diff(), torch.full((63,), 400e6 / 64, dtype=torch.float64))
     with pytest.raises(InputError, match="positive bandwidth"):
         ofdm(-1.0, 4)
+
+
+def test_patterns_are_their_published_formulas():
+    """Angle by angle, in degrees: 3GPP TR 38.901 table 7.3-1, the short dipole, and 6 cos^2 for the patch."""
+    for zenith in range(5, 180, 25):
+        for azimuth in range(-175, 180, 35):
+            direction = direction_of(*(torch.deg2rad(torch.tensor(float(angle))) for angle in (zenith, azimuth)))
+            vertical = -min(12 * ((zenith - 90) / 65) ** 2, 30)
+            horizontal = -min(12 * (azimuth / 65) ** 2, 30)
+            boresight = math.sin(math.radians(zenith)) * math.cos(math.radians(azimuth))
+            expected = {
+                "isotropic": 1.0,
+                "dipole": 1.5 * math.sin(math.radians(zenith)) ** 2,
+                "patch": 6 * boresight**2 if boresight > 0 else 0.0,
+                "tr38901": 10 ** ((8 - min(-(vertical + horizontal), 30)) / 10),
+            }
+            for name, gain in expected.items():
+                assert float(power_pattern(name, direction)) == pytest.approx(gain, rel=1e-4, abs=1e-9), name
+
+
+def test_a_patch_has_half_its_power_at_forty_five_degrees_and_seven_point_eight_dbi():
+    ahead, off = power_pattern("patch", torch.tensor([[1.0, 0.0, 0.0], [math.sqrt(0.5), 0.0, math.sqrt(0.5)]]))
+    assert 10 * math.log10(ahead) == pytest.approx(7.78, abs=0.01)
+    assert float(off / ahead) == pytest.approx(0.5, abs=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (4, 3), (16, 16)], ids=str)
+def test_the_manifold_is_the_product_of_its_factors(shape):
+    array = planar_array(*shape, "tr38901", vertical=0.7, horizontal=0.4)
+    directions = equirect_grid(20, 10).directions.reshape(-1, 3).double()
+    columns, rows = manifold_factors(array, directions)
+    product = (columns[:, None] * rows).reshape(array.count, -1).mT
+    gain = power_pattern(array.pattern, directions).sqrt()
+    # one rounding a step of at most sixteen
+    assert torch.allclose(product * gain[:, None], manifold(array, directions), rtol=0, atol=1e-13)

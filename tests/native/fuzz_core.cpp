@@ -20,6 +20,8 @@
 #include <vector>
 
 #include "core/thread_pool.hpp"
+#include "spectra/deposit.hpp"
+#include "spectra/responses.hpp"
 #include "splats/constants.hpp"
 #include "splats/image_loss.hpp"
 #include "splats/kernels.hpp"
@@ -441,6 +443,40 @@ void large_picture() {
   require(all_finite(out.picture), "a large picture is finite");
 }
 
+// Paths of spectra: some with hostile places and directions. Gains are conserved where all numbers are numbers, and one
+// thread and several give the same bits.
+void sums_over_paths() {
+  const bool tame = chance(0.5f);
+  const size_t count = one_of<size_t>({0, 1, 7, 500, 40000});
+  const auto number = [&] { return !tame && chance(0.01f) ? hostile() : normal(); };
+  const int rows = one_of({2, 7, 8, 9, 33}), columns = one_of({2, 12, 35}), fold = one_of({0, 1, 3});
+  Floats directions(3 * count), gain(count), delay(count), departures(3 * count);
+  for (Floats* values : {&directions, &delay, &departures}) std::generate(values->begin(), values->end(), number);
+  for (float& value : gain) value = chance(0.2f) ? 0.0f : std::abs(normal());
+  const ArrivingPaths arriving{directions.data(), gain.data(), delay.data(), departures.data()};
+  const size_t nodes = static_cast<size_t>(rows) * columns;
+  std::vector<double> once(kDepositChannels * nodes), again(once);
+  deposit_paths(arriving, count, rows, columns, fold, once.data(), 1);
+  deposit_paths(arriving, count, rows, columns, fold, again.data(), 3);
+  require(std::memcmp(once.data(), again.data(), once.size() * sizeof(double)) == 0, "deposits differ between threads");
+  double there = 0.0, given = 0.0;
+  for (size_t node = 0; node < nodes; ++node) there += once[node];
+  for (float value : gain) given += value;
+  require(std::abs(there - given) <= 1e-9 * (1.0 + given), "a deposit loses gain");
+
+  const int array_rows = one_of({1, 3, 8}), array_cols = one_of({1, 2, 5}), cells = one_of({2, 14, 40, 512});
+  std::vector<double> coeff(2 * count), place(count), towards(3 * count), polynomials(kSpreadTerms * kSpreadColumns);
+  for (std::vector<double>* values : {&coeff, &towards}) std::generate(values->begin(), values->end(), number);
+  for (double& value : place) value = !tame && chance(0.01f) ? hostile() : uniform(0.0f, 1.0f) * cells;
+  for (int tap = 0; tap < kSpreadWidth; ++tap) polynomials[(kSpreadTerms - 1) * kSpreadColumns + tap] = 1.0;
+  const PathWaves waves{coeff.data(), place.data(), towards.data(), polynomials.data(), 3.1, -3.2, array_rows, array_cols};
+  const size_t elements = static_cast<size_t>(array_rows) * array_cols;
+  std::vector<double> total(2 * elements * cells, 0.0), repeated(total);
+  spread_responses(waves, count, cells, total.data(), 1);
+  spread_responses(waves, count, cells, repeated.data(), 3);
+  require(std::memcmp(total.data(), repeated.data(), total.size() * sizeof(double)) == 0, "responses differ");
+}
+
 }  // namespace
 
 int main(int count, char** words) {
@@ -453,6 +489,7 @@ int main(int count, char** words) {
     picture_loss();
     harmonics();
     trainer();
+    sums_over_paths();
     if (round_number % 10 == 0) pool();
     if (round_number % 25 == 5 && forks) fork_and_draw();
   }

@@ -9,7 +9,8 @@ import sys
 import pytest
 import torch
 
-from rf3dgs.channel.arrays import planar_array
+from rf3dgs.channel.arrays import ofdm, planar_array
+from rf3dgs.channel.paths import Paths
 from rf3dgs.channel.patterns import field_pattern
 from rf3dgs.channel.response import manifold
 from rf3dgs.core.angles import direction_of
@@ -23,12 +24,16 @@ SHAPES = ((1, 1), (3, 5), (8, 8))
 NAMES = {"iso": "isotropic", "dipole": "dipole", "tr38901": "tr38901"}
 FREQUENCY = 60e9
 TX = (1.0, 2.0, 3.0)
+BOX_FREQUENCY = 1e9  # so low, and delays so short, that single precision gives the carrier's phase to 1e-5
+BOX_TX = ((-1.0, -1.5, 3.0), 0.6)
+BOX_RX = ((1.0, 2.0, 1.5), -2.3)
 RX = (((4.0, 5.0, 2.0), 0.3), ((-3.0, 4.0, 5.0), -0.9), ((6.0, 1.5, 3.0), 3.1))
 
 ORACLE = """
 import json, sys
 import mitsuba as mi
 import numpy as np
+import sionna.rt
 from sionna.rt import PathSolver, PlanarArray, Receiver, Transmitter, load_scene
 
 asked = json.load(sys.stdin)
@@ -55,6 +60,24 @@ for pattern in asked["patterns"]:
         paths = PathSolver()(scene, max_depth=0, los=True, synthetic_array=True)
         real, imaginary = (np.array(part)[:, :, 0, 0, 0].tolist() for part in paths.a)
         answer["response"][f"{pattern} {rows}x{cols}"] = [real, imaginary]
+
+box = load_scene(sionna.rt.scene.box)
+box.frequency = asked["box"]["frequency"]
+(tx, tx_yaw), (rx, rx_yaw) = asked["box"]["tx"], asked["box"]["rx"]
+box.add(Transmitter("tx", position=tx, orientation=[tx_yaw, 0.0, 0.0]))
+box.add(Receiver("rx", position=rx, orientation=[rx_yaw, 0.0, 0.0]))
+
+def solved(tx_shape, rx_shape):
+    box.tx_array, box.rx_array = planar("iso", *tx_shape), planar("iso", *rx_shape)
+    return PathSolver()(box, max_depth=1, los=True, specular_reflection=True, refraction=False, synthetic_array=True)
+
+single = solved((1, 1), (1, 1))
+names = ("tau", "theta_r", "phi_r", "theta_t", "phi_t", "valid")
+answer["paths"] = {name: np.array(getattr(single, name))[0, 0].tolist() for name in names}
+answer["paths"]["a"] = [np.array(part)[0, 0, 0, 0].tolist() for part in single.a]
+response = solved((2, 2), (3, 5)).cfr(mi.Float(np.float32(asked["box"]["offsets"])), normalize_delays=False,
+                                      out_type="numpy")[0, :, 0, :, 0]
+answer["cfr"] = [response.real.tolist(), response.imag.tolist()]
 json.dump(answer, sys.stdout)
 """
 
@@ -80,6 +103,7 @@ def sionna(directions):
         "frequency": FREQUENCY,
         "tx": TX,
         "rx": RX,
+        "box": {"frequency": BOX_FREQUENCY, "tx": BOX_TX, "rx": BOX_RX, "offsets": ofdm(1e8, 16).tolist()},
     }
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", ORACLE],
@@ -122,3 +146,27 @@ def test_array_response_to_the_line_of_sight_equals_sionnas(name, shape, sionna)
         common = (theirs * ours.conj()).sum()
         theirs = theirs * (common.conj() / common.abs())
         assert float((ours - theirs).abs().max()) < 1e-5 * max(1.0, float(ours.abs().max()))
+
+
+def test_frequency_response_of_a_room_equals_sionnas(sionna):
+    """Line of sight and six mirrors of a room, both arrays, sixteen subcarriers, from paths between single antennas."""
+    found = {name: torch.tensor(value) for name, value in sionna["paths"].items()}
+    paths = Paths(
+        coeff=torch.complex(*found["a"]),
+        delay=found["tau"],
+        aoa_zenith=found["theta_r"],
+        aoa_azimuth=found["phi_r"],
+        aod_zenith=found["theta_t"],
+        aod_azimuth=found["phi_t"],
+        valid=found["valid"],
+        frequency=BOX_FREQUENCY,
+        tx=Pose.from_yaw(*BOX_TX),
+        rx=Pose.from_yaw(*BOX_RX),
+    )
+    assert int(paths.count) == 7
+    spaced = {"vertical": 0.6, "horizontal": 0.45}
+    rx, tx = planar_array(3, 5, "isotropic", **spaced), planar_array(2, 2, "isotropic", **spaced)
+    ours = paths.cfr(rx, tx, ofdm(1e8, 16))
+    theirs = torch.complex(*(torch.tensor(part) for part in sionna["cfr"]))
+    assert ours.shape == theirs.shape == (15, 4, 16)
+    assert float((ours - theirs).abs().max()) < 1e-5 * float(theirs.abs().max())

@@ -173,3 +173,27 @@ def test_a_lobe_too_narrow_for_the_grid_is_refused(random_paths):
 def test_noise_needs_an_array(random_paths):
     with pytest.raises(InputError, match='method="bartlett"'):
         spectrum_of(random_paths(1), grid=SPHERE, snr_db=20)
+
+
+@pytest.mark.parametrize(
+    "grid",
+    [
+        equirect_grid(12, 6),
+        equirect_grid(50, 37),
+        pinhole_grid(31, 17, 150),
+        list_grid(torch.randn(77, 3, generator=torch.Generator().manual_seed(0))),
+    ],
+    ids=["coarse", "sphere", "pinhole", "list"],
+)
+@pytest.mark.parametrize("lobe_deg", [45.0, 100.0])
+def test_lobes_reach_every_pixel_within_their_cut(grid, lobe_deg, random_paths):
+    """Against the sum over all pairs of a pixel and a path, without blocks; spheres apart from their normalisation."""
+    paths, lobe = random_paths(20), math.radians(lobe_deg)
+    spectrum = spectrum_of(paths, grid=grid, lobe=lobe)
+    angle = angle_between(grid.directions[..., None, :].double(), paths.aoa.double().expand(*grid.shape, 20, 3))
+    kernel = torch.exp(-4 * math.log(2) * (angle / lobe) ** 2)
+    kernel = torch.where(kernel >= 1e-8, kernel, torch.zeros_like(kernel))
+    if grid.kind == "equirect":
+        kernel = kernel * (math.pi * lobe**2 / (4 * math.log(2))) / (kernel * grid.solid_angle[..., None]).sum((0, 1))
+    expected = (kernel * paths.path_gain.double()).sum(-1)
+    assert torch.allclose(spectrum.power.double(), expected, rtol=1e-5, atol=1e-20)

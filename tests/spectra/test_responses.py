@@ -13,9 +13,9 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.native import native_core
 from rf3dgs.spectra import responses as module
 from rf3dgs.spectra.covariance import covariance_of, covariance_of_snapshots, delay_taps
+from rf3dgs.spectra.deposit import deposit, deposited, values_of
 from rf3dgs.spectra.responses import FEW, kernel, kernel_polynomials, kernel_transform, responses
 from rf3dgs.spectra.scan import spectrum_of
-from rf3dgs.spectra.synthesis import _deposited, _values, deposit
 
 SHAPES = [(1, 1), (3, 5), (8, 4), (1, 9)]
 
@@ -127,8 +127,8 @@ def test_the_native_deposit_is_its_specification(sphere, random_paths):
     paths = random_paths(20_000)
     poles = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [-1.0, -1e-9, 0.0]])
     directions = torch.cat((paths.aoa[:-4], poles))
-    found = _deposited(directions, paths.path_gain, paths.delay, paths.aod, sphere)
-    expected = deposit(directions, _values(paths.path_gain, paths.delay, paths.aod), sphere)
+    found = deposited(directions, paths.path_gain, paths.delay, paths.aod, sphere)
+    expected = deposit(directions, values_of(paths.path_gain, paths.delay, paths.aod), sphere)
     for channel in range(5):
         scale = float(expected[channel].abs().max())
         assert float((found - expected)[channel].abs().max()) < 2e-4 * scale
@@ -140,29 +140,33 @@ def test_directions_that_are_none_do_not_write_past_the_sphere(random_paths):
     directions = paths.aoa.clone()
     directions[0] = float("nan")
     directions[1] = 0.0
-    found = _deposited(directions, paths.path_gain, paths.delay, paths.aod, (6, 12, 1))
+    found = deposited(directions, paths.path_gain, paths.delay, paths.aod, (6, 12, 1))
     assert float(found[0].sum()) == pytest.approx(float(paths.path_gain.double().sum()), rel=1e-9)
 
 
 THREADS = """
 import hashlib, sys, torch
 from rf3dgs.channel.arrays import planar_array
-from rf3dgs.spectra import responses, synthesis
+from rf3dgs.spectra import deposit, responses
 generator = torch.Generator().manual_seed(0)
 count = 60_000
 directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
 gain, delay = torch.rand(count, generator=generator), 1e-7 * torch.rand(count, generator=generator)
-digest = hashlib.sha256()
+core = responses.native_core
 for threads in (1, 2, 5):
-    responses.thread_count = synthesis.thread_count = lambda threads=threads: threads
+    responses.thread_count = deposit.thread_count = lambda threads=threads: threads
     x = responses.responses(gain.to(torch.complex128), delay, directions, planar_array(3, 3), 64, 1e9)
-    y = synthesis._deposited(directions, gain, delay, directions, (60, 120, 3))
+    y = deposit.deposited(directions, gain, delay, directions, (60, 120, 3))
+    responses.native_core = lambda: None
+    page = responses.responses(gain.to(torch.complex128), delay, directions, planar_array(3, 3), 64, 1e9)
+    responses.native_core = core
+    assert float((x - page).abs().max()) < 1e-9 * float(page.abs().max())
     print(hashlib.sha256(torch.view_as_real(x).numpy().tobytes() + y.numpy().tobytes()).hexdigest())
 """
 
 
 @pytest.mark.parametrize("instructions", ["portable", "avx2", "avx512"])
-def test_sums_over_paths_are_the_same_bits_on_any_number_of_threads(instructions):
+def test_sums_over_paths_are_the_pages_and_the_same_bits_on_any_number_of_threads(instructions):
     environment = {**os.environ, "RF3DGS_ISA": instructions, "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-c", THREADS], capture_output=True, text=True, check=False, env=environment, timeout=120

@@ -184,3 +184,25 @@ def test_wrong_arguments_are_told(random_paths, arguments, message):
 def test_impossible_loadings_are_refused(amount, rule, message):
     with pytest.raises(InputError, match=message):
         Loading(amount, rule)
+
+
+@pytest.mark.parametrize("method", ["bartlett", "tapered", "capon", "music"])
+def test_louder_paths_give_a_louder_picture_and_music_the_same(method, random_paths):
+    paths = random_paths(40)
+    louder = paths._map(lambda value: 10.0 * value if value.is_complex() else value)
+    extra = {"sources": 9} if method == "music" else {}
+    first, second = (
+        spectrum_of(one, ARRAY, GRID, method=method, snr_db=20, **extra).power.double() for one in (paths, louder)
+    )
+    assert torch.allclose(second, first * (1.0 if method == "music" else 100.0), rtol=1e-4)
+
+
+def test_delaying_every_path_changes_no_spectrum(random_paths):
+    """A common phase per frequency cancels in the covariance."""
+    paths = random_paths(40)
+    late = paths._map(lambda value: value)
+    late.delay.add_(2.0**-25)  # exact in single precision beside the delays of these paths, to a few 1e-15 s
+    for method in ("bartlett", "capon"):
+        first, second = (spectrum_of(one, ARRAY, GRID, method=method).gain_db for one in (random_paths(40), late))
+        # 4e-15 s turn a carrier of 60 GHz by 1.5e-3 rad, which shows most in the valleys
+        assert float((first - second).abs().median()) < 0.05

@@ -8,7 +8,7 @@ from torch import Tensor
 from rf3dgs.channel.arrays import PlanarArray, ofdm
 from rf3dgs.channel.paths import Paths
 from rf3dgs.channel.patterns import power_pattern
-from rf3dgs.channel.response import coefficients, manifold, phasors
+from rf3dgs.channel.response import coefficients, phasors
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.spectra.responses import responses
@@ -106,11 +106,10 @@ def covariance_of_spectrum(spectrum: Spectrum, array: PlanarArray) -> Tensor:
 
     R = sum over pixels of P dOmega a a^H / beam solid angle: every pixel is an uncorrelated plane wave.
     """
-    directions = spectrum.grid.directions.reshape(-1, 3).double()
+    directions = spectrum.grid.directions.reshape(-1, 3)
     weight = (spectrum.power * spectrum.grid.solid_angle).double() / spectrum.instrument.beam_solid_angle
-    steering = manifold(array, directions)
     batch = spectrum.power.shape[:-2]
-    rows = [(steering.mT * row) @ steering.conj() for row in weight.reshape(-1, len(directions))]
+    rows = [plane_waves(row, directions, array) for row in weight.reshape(-1, len(directions))]
     return torch.stack(rows).reshape(*batch, array.count, array.count)
 
 

@@ -9,7 +9,6 @@ columns m and n are apart, so the entries of Q that share such a lag are summed 
 with y, z the phasors of one column and one row, e_0 = 1 and e_dc = 2: (2 rows - 1) cols multiplications a direction.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -19,7 +18,7 @@ from rf3dgs.channel.arrays import PlanarArray
 from rf3dgs.channel.patterns import power_pattern
 from rf3dgs.channel.response import phasors
 
-AT_ONCE = 4096  # directions: their phasors stay in the cache
+AT_ONCE = 2048  # directions: what is made of them stays in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +64,16 @@ class ManifoldSteering:
 
     def forms(self, Q: Tensor) -> Tensor:
         """v^H Q v `[n]`, float64, of a Hermitian Q `[element, element]` over the flattened directions."""
-        flat = self.A.reshape(-1, self.A.shape[-1]).to(torch.complex128)
-        norm = torch.linalg.vector_norm(flat, dim=-1, keepdim=True)
-        steering = flat * (math.sqrt(flat.shape[-1]) / norm.clamp_min(1e-300))
-        steering = torch.where(norm > 0, steering, torch.zeros_like(steering))
-        return ((steering.conj() @ Q) * steering).sum(-1).real
+        flat = self.A.reshape(-1, self.A.shape[-1])
+        result = torch.empty(len(flat), dtype=torch.float64)
+        opposite = Q.conj().resolve_conj()
+        for first in range(0, len(flat), AT_ONCE):
+            part = flat[first : first + AT_ONCE].to(torch.complex128)
+            turned, plain = torch.view_as_real(part @ opposite), torch.view_as_real(part)
+            square = plain.square().sum((-2, -1))
+            form = (turned * plain).sum((-2, -1)) * (flat.shape[-1] / square.clamp_min(1e-300))
+            result[first : first + AT_ONCE] = torch.where(square > 0, form, torch.zeros_like(form))
+        return result
 
 
 Steering = PlanarSteering | ManifoldSteering

@@ -14,12 +14,12 @@ from torch import Tensor
 
 from rf3dgs.channel.binning import DIFFUSE
 from rf3dgs.channel.paths import Paths
-from rf3dgs.core.angles import angles_of
+from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid, sample_grid
-from rf3dgs.core.native import native_core, thread_count
 from rf3dgs.core.progress import Progress, Silent
+from rf3dgs.spectra.deposit import CHANNELS, deposited, values_of
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 
 CUT = 1e-8  # relative power at which the lobe ends
@@ -27,7 +27,7 @@ FLOOR = 1e-12  # of the strongest diffuse pixel: below it the FFT's rounding beg
 EXACT_ALWAYS = 1024  # a receiver with at most so many paths is summed exactly
 EXACT_STRONGEST = 256  # so many of the strongest paths are exact beside the line of sight and mirrors
 NARROWEST = 1.4  # lobe over pixel spacing: below it the sum over pixels loses path gain
-CHANNELS = 5
+BLOCK = 12  # pixels on a side of the blocks that tell which lobes are near
 
 
 def default_lobe(grid: DirectionGrid) -> float:
@@ -113,13 +113,14 @@ class LobeSum:
         self.whole_sphere = grid.kind == "equirect"
         self.solid_angle = grid.solid_angle.reshape(-1).double()
         self.sphere: _Sphere | None = None
+        self.blocks, self.centres, self.reach = _blocks(grid, self.cut)
 
     def __call__(self, paths: Paths, world_from_device: Tensor) -> Tensor:
         """Sums `[row, col, 5]` (float64) of power, power x delay [s] and power x departure vector of one receiver."""
         gain = paths.path_gain
         directions, departures = paths.aoa @ world_from_device, paths.aod
         exact = _exact(paths, gain)
-        total = self._sum_exactly(directions[exact], _values(gain[exact], paths.delay[exact], departures[exact]))
+        total = self._sum_exactly(directions[exact], values_of(gain[exact], paths.delay[exact], departures[exact]))
         gain = torch.where(exact, torch.zeros_like(gain), gain)
         if bool((gain > 0).any()):
             if self.sphere is None:
@@ -131,10 +132,14 @@ class LobeSum:
         """Sum every lobe at every pixel within its cut."""
         total = torch.zeros(len(self.directions), CHANNELS, dtype=torch.float64)
         nearest = math.cos(self.cut) - 1e-6
-        step = max(1, 2**23 // max(1, len(self.directions)))
+        step = max(1, 2**21 // max(1, len(self.directions)))
         for start in range(0, len(directions), step):
             part = directions[start : start + step]
-            pixel, path = torch.nonzero(self.directions @ part.mT >= nearest, as_tuple=True)
+            block, path = torch.nonzero(self.centres @ part.mT >= self.reach[:, None], as_tuple=True)
+            pixel = self.blocks[block]
+            inside = (self.directions[pixel] * part[path, None]).sum(-1) >= nearest
+            path = path[:, None].expand_as(pixel)[inside & (pixel >= 0)]
+            pixel = pixel[inside & (pixel >= 0)]
             chord = (self.directions[pixel].double() - part[path].double()).square().sum(-1)
             kernel = torch.exp(-self.sharpness * (2 * torch.asin((chord.sqrt() / 2).clamp_max(1.0))) ** 2)
             kernel = torch.where(kernel >= CUT, kernel, torch.zeros_like(kernel))
@@ -144,6 +149,27 @@ class LobeSum:
                 kernel = kernel * (math.pi / self.sharpness / seen)[path]
             total.index_add_(0, pixel, kernel[:, None] * values[start + path])
         return total.reshape(*self.grid.shape, CHANNELS)
+
+
+def _blocks(grid: DirectionGrid, cut: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels of small blocks of the grid `[block, pixel]` (-1 is none), their middles, and how near a lobe must be.
+
+    A lobe that ends at `cut` [rad] touches a block only where the cosine of the angle to its middle `[block, 3]` is at
+    least `[block]`. A block that goes around the sphere has no middle and is always near.
+    """
+    height, width = grid.shape
+    tall = min(BLOCK, height)
+    number = torch.arange(height * width).reshape(height, width)
+    number = torch.nn.functional.pad(number, (0, -width % BLOCK, 0, -height % tall), value=-1)
+    blocks = number.reshape(number.shape[0] // tall, tall, number.shape[1] // BLOCK, BLOCK)
+    blocks = blocks.transpose(1, 2).reshape(-1, tall * BLOCK)
+    some = torch.where(blocks < 0, blocks[:, :1], blocks)
+    members = grid.directions.reshape(-1, 3)[some]
+    middles = members.mean(1)
+    radius = angle_between(members, middles[:, None].expand_as(members)).amax(1)
+    radius = torch.where(torch.linalg.vector_norm(middles, dim=-1) < 0.01, torch.full_like(radius, math.pi), radius)
+    middles = torch.nn.functional.normalize(middles, dim=-1)
+    return blocks, middles, torch.cos((cut + radius).clamp_max(math.pi)) - 1e-5
 
 
 def _exact(paths: Paths, gain: Tensor) -> Tensor:
@@ -160,12 +186,6 @@ def _exact(paths: Paths, gain: Tensor) -> Tensor:
         exact = torch.zeros_like(exact)
     exact[gain.topk(EXACT_STRONGEST).indices] = True
     return exact
-
-
-def _values(gain: Tensor, delay: Tensor, departures: Tensor) -> Tensor:
-    """Gain, gain x delay and gain x departure vector `[path, 5]`, float64."""
-    gain = gain.double()[:, None]
-    return torch.cat((gain, gain * delay[:, None], gain * departures), -1)
 
 
 class _Sphere:
@@ -214,8 +234,8 @@ class _Sphere:
 
     def __call__(self, directions: Tensor, gain: Tensor, delay: Tensor, departures: Tensor) -> Tensor:
         """The smoothed sums `[row, col, 5]` on the grid of paths at device-frame `directions` `[path, 3]`."""
-        deposit = _deposited(directions, gain, delay, departures, (self.rows, self.columns, self.fold))
-        waves = torch.fft.rfft(deposit * self.scale[:, None], dim=-1)
+        sums = deposited(directions, gain, delay, departures, (self.rows, self.columns, self.fold))
+        waves = torch.fft.rfft(sums * self.scale[:, None], dim=-1)
         lines = torch.stack([(waves[:, first:last] * kernel).sum(1) for first, last, kernel in self.kernels], 1)
         smooth = torch.fft.irfft(lines, self.columns)[..., :: self.fold]
         smooth = torch.where(smooth[0] < FLOOR * smooth[0].max(), torch.zeros_like(smooth), smooth)
@@ -223,39 +243,3 @@ class _Sphere:
         if self.grid.kind == "equirect":
             return picture
         return sample_grid(picture, self.picture, self.grid.directions)
-
-
-def _deposited(
-    directions: Tensor, gain: Tensor, delay: Tensor, departures: Tensor, sphere: tuple[int, int, int]
-) -> Tensor:
-    """Bilinear deposit of `_values` onto the nodes of a sphere of (rows, columns, fold): `[5, rows, columns]`.
-
-    In the native core where there is one; `deposit` is its specification.
-    """
-    rows, columns, fold = sphere
-    core = native_core()
-    if core is None:
-        return deposit(directions, _values(gain, delay, departures), sphere)
-    total = torch.empty(CHANNELS, rows, columns, dtype=torch.float64)
-    arrays = (value.float().contiguous().numpy() for value in (directions, gain, delay, departures))
-    core.deposit_paths(*arrays, fold, total.numpy(), thread_count())
-    return total
-
-
-def deposit(directions: Tensor, values: Tensor, sphere: tuple[int, int, int]) -> Tensor:
-    """Bilinear deposit of `values` `[path, 5]` onto the nodes of a sphere of (rows, columns, fold), in NumPy."""
-    rows, columns, fold = sphere
-    zenith, azimuth = (angle.double().numpy() for angle in angles_of(directions))
-    y = zenith * (rows / math.pi) - 0.5
-    x = (math.pi - azimuth) * (columns / (2 * math.pi)) - 0.5 * fold
-    row, column = np.floor(y), np.floor(x)
-    down, right = y - row, x - column
-    channels = np.ascontiguousarray(values.numpy().T)
-    total = np.zeros((CHANNELS, rows * columns))
-    for i, row_weight in ((0, 1 - down), (1, down)):
-        at_row = np.clip(row.astype(np.int64) + i, 0, rows - 1) * columns
-        for j, weight in ((0, row_weight * (1 - right)), (1, row_weight * right)):
-            node = at_row + (column.astype(np.int64) + j) % columns
-            for channel in range(CHANNELS):
-                total[channel] += np.bincount(node, channels[channel] * weight, rows * columns)
-    return torch.from_numpy(total.reshape(CHANNELS, rows, columns))
