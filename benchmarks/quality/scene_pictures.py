@@ -69,9 +69,15 @@ def draw_ellipsoids() -> np.ndarray:
         scene = mitsuba.load_dict(
             {
                 "type": "scene",
-                "integrator": {"type": "path", "max_depth": 3},
-                "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.75}},
-                "sun": {"type": "point", "position": [11.0, 3.0, 2.6], "intensity": {"type": "rgb", "value": 9.0}},
+                "integrator": {"type": "path", "max_depth": 2},
+                **{
+                    f"lamp-{number}": {
+                        "type": "point",
+                        "position": [*place, 2.0],
+                        "intensity": {"type": "rgb", "value": 14.0},
+                    }
+                    for number, place in enumerate(((11.5, 3.0), (3.0, 3.0), (11.0, 12.0), (3.0, 12.0), (7.0, 7.5)))
+                },
                 "things": {
                     "type": "ply",
                     "filename": str(path),
@@ -92,7 +98,7 @@ def draw_ellipsoids() -> np.ndarray:
                 },
             }
         )
-        light = np.array(mitsuba.render(scene, spp=64))[..., :3]
+        light = np.array(mitsuba.render(scene, spp=36))[..., :3]
     return np.round(255 * np.clip(light, 0, 1) ** (1 / 2.2)).astype(np.uint8)
 
 
