@@ -168,6 +168,17 @@ def test_a_folder_without_table_or_meshes_is_refused(tmp_path):
         read_mesh_folder(tmp_path)
 
 
+def test_a_folder_named_like_a_scene_does_not_hide_it(tmp_path, tracer, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "box").mkdir()
+    assert scene_of("box").source is not None
+    room(tmp_path / "box")
+    assert scene_of("box").source is None
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match=r"expected materials.toml"):
+        scene_of(tmp_path / "empty")
+
+
 def test_links_out_of_the_folder_are_refused(tmp_path):
     folder = room(tmp_path / "office")
     vertices, faces, _ = shapes.box((0, 0, 0), (1, 1, 1))

@@ -247,6 +247,18 @@ def test_unsafe_scene_files_are_refused(tmp_path, text, message):
     assert "scene.xml" in str(caught.value)
 
 
+@pytest.mark.parametrize("name", ["/etc/passwd", "../a.ply"])
+def test_a_scene_that_reads_other_folders_is_never_loaded(tmp_path, name):
+    (tmp_path / "site.xml").write_text(plain(f'<shape type="ply"><string name="filename" value="{name}"/></shape>'))
+    with pytest.raises(
+        DataError, match=r"site\.xml names the file .* only files in the scene's own folder may be read"
+    ):
+        scene_of(tmp_path / "site.xml")
+    (tmp_path / "site.xml").write_text(plain(f'<include filename="{name}"/>'))
+    with pytest.raises(DataError, match=r"site\.xml has a <include> element, which is refused"):
+        scene_of(tmp_path / "site.xml")
+
+
 def test_missing_scene_files_are_data_errors(tmp_path):
     with pytest.raises(DataError, match=r"cannot read the scene .*nowhere.xml"):
         scene_of(tmp_path / "nowhere.xml")
