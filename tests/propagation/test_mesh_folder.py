@@ -240,6 +240,28 @@ def test_every_truncation_of_a_glb_is_refused_or_read(tmp_path):
             mesh_files.read_meshes(path)
 
 
+@pytest.mark.parametrize("kind", ["ply", "obj", "glb"])
+def test_flipped_bytes_are_one_error_or_finite_meshes(tmp_path, kind):
+    whole = trimesh.creation.icosphere(subdivisions=1).export(file_type=kind)
+    whole = whole.encode() if isinstance(whole, str) else whole
+    generator = np.random.default_rng(0)
+    path = tmp_path / f"a.{kind}"
+    refused = []
+    for _ in range(150):
+        data = bytearray(whole)
+        data[int(generator.integers(len(data)))] ^= 1 << int(generator.integers(8))
+        path.write_bytes(data)
+        try:
+            found = mesh_files.read_meshes(path)
+        except DataError as error:
+            refused.append(str(error))
+        else:
+            assert all(np.isfinite(mesh.vertices).all() and len(mesh.faces) for mesh in found)
+            assert all(0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices) for mesh in found)
+    assert 0 < len(refused) < 150
+    assert all(f"a.{kind}" in message for message in refused)
+
+
 def test_without_trimesh_the_error_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "trimesh", None)
     with pytest.raises(MissingDependencyError, match=r'pip install "rf3dgs\[mesh\]"'):
