@@ -1,5 +1,6 @@
 import json
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -158,6 +159,16 @@ def test_faulty_tables_are_refused_with_their_name(tmp_path, table, message):
     with pytest.raises(DataError, match=message) as caught:
         read_mesh_folder(folder)
     assert "materials.toml" in str(caught.value)
+
+
+def test_the_table_of_the_page_is_one(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "scenes.md").read_text()
+    folder = room(tmp_path / "office", page.split("```toml\n")[1].split("```")[0])
+    vertices, faces, _ = shapes.prism((3.0, 2.5), 0.2, 0.0, 3.0, 8)
+    meshes.write_mesh(folder / "pillar-1.ply", vertices, faces, None)
+    scene = read_mesh_folder(folder)
+    assert scene["pillar-1"].electric == (5.2, 0.6)
+    assert (scene["cupboard"].material, scene["room"].material) == ("metal", "plasterboard")
 
 
 def test_a_folder_without_table_or_meshes_is_refused(tmp_path):
