@@ -2,7 +2,7 @@
 
     python -m benchmarks.quality.coverage [SCENE] [--counts 60 120 240] [--distance 8]
 
-Printed: the share of the area that three or more photographs see at less than 60 degrees from its normal, with nothing in
+Printed: the share of the area that three or more photographs see at less than 60 degrees from its normal, nothing in
 between, from closer than the distance; for the whole scene and for the named objects of the lobby.
 """
 

@@ -8,6 +8,7 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.propagation.lobby import lobby
 from rf3dgs.propagation.lobby_extras import PEOPLE
 from rf3dgs.propagation.scene_files import write_radio_scene
+from rf3dgs.propagation.scenes import scene_of
 
 PLAIN = "c3aca42a62155c72348fa457dbb659289374c4e71185aac21e8a60b096b8eea3"
 PLAIN_RADIO = "cde7912290f25546b7f91987ac05f145c968a5949be8bf65aa9ed2bc672b214b"
@@ -67,6 +68,19 @@ def test_receivers_and_transmitter_find_free_space_in_the_full_lobby(full):
     assert all(full.occupant(position) is None for position in rx.position)
     person = next(item for item in full.objects if item.name == "person-1-coat")
     assert full.occupant(person.vertices.mean(0)) == "person-1-coat"
+
+
+def test_the_full_lobby_has_a_name(site):
+    names = [item.name for item in scene_of("lobby-full").objects]
+    assert "sofa-1" in names
+    assert not any(name.startswith("person") for name in names)
+    assert [item.name for item in scene_of("lobby").objects] == [item.name for item in site.objects]
+
+
+def test_the_nearest_object_is_named_with_its_distance(site):
+    name, distance = site.nearest(torch.tensor([4.5, 4.1, 1.5]))
+    assert name == "column-1"
+    assert distance == pytest.approx(0.2, abs=1e-5)
 
 
 def test_people_are_optional_and_counted():

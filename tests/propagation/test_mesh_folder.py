@@ -1,5 +1,6 @@
 import json
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -160,12 +161,33 @@ def test_faulty_tables_are_refused_with_their_name(tmp_path, table, message):
     assert "materials.toml" in str(caught.value)
 
 
+def test_the_table_of_the_page_is_one(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "scenes.md").read_text()
+    folder = room(tmp_path / "office", page.split("```toml\n")[1].split("```")[0])
+    vertices, faces, _ = shapes.prism((3.0, 2.5), 0.2, 0.0, 3.0, 8)
+    meshes.write_mesh(folder / "pillar-1.ply", vertices, faces, None)
+    scene = read_mesh_folder(folder)
+    assert scene["pillar-1"].electric == (5.2, 0.6)
+    assert (scene["cupboard"].material, scene["room"].material) == ("metal", "plasterboard")
+
+
 def test_a_folder_without_table_or_meshes_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"expected materials.toml or materials.json"):
         read_mesh_folder(tmp_path)
     (tmp_path / "materials.toml").write_text(SITE + OBJECTS)
     with pytest.raises(DataError, match=r"has no meshes; expected files ending in .ply, .obj, .glb"):
         read_mesh_folder(tmp_path)
+
+
+def test_a_folder_named_like_a_scene_does_not_hide_it(tmp_path, tracer, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "box").mkdir()
+    assert scene_of("box").source is not None
+    room(tmp_path / "box")
+    assert scene_of("box").source is None
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match=r"expected materials.toml"):
+        scene_of(tmp_path / "empty")
 
 
 def test_links_out_of_the_folder_are_refused(tmp_path):
@@ -227,6 +249,28 @@ def test_every_truncation_of_a_glb_is_refused_or_read(tmp_path):
         path.write_bytes(whole[:length])
         with pytest.raises(DataError, match=r"a\.glb"):
             mesh_files.read_meshes(path)
+
+
+@pytest.mark.parametrize("kind", ["ply", "obj", "glb"])
+def test_flipped_bytes_are_one_error_or_finite_meshes(tmp_path, kind):
+    whole = trimesh.creation.icosphere(subdivisions=1).export(file_type=kind)
+    whole = whole.encode() if isinstance(whole, str) else whole
+    generator = np.random.default_rng(0)
+    path = tmp_path / f"a.{kind}"
+    refused = []
+    for _ in range(150):
+        data = bytearray(whole)
+        data[int(generator.integers(len(data)))] ^= 1 << int(generator.integers(8))
+        path.write_bytes(data)
+        try:
+            found = mesh_files.read_meshes(path)
+        except DataError as error:
+            refused.append(str(error))
+        else:
+            assert all(np.isfinite(mesh.vertices).all() and len(mesh.faces) for mesh in found)
+            assert all(0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices) for mesh in found)
+    assert 0 < len(refused) < 150
+    assert all(f"a.{kind}" in message for message in refused)
 
 
 def test_without_trimesh_the_error_says_what_to_install(tmp_path, monkeypatch):

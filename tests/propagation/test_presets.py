@@ -185,6 +185,22 @@ def test_radio_passes_a_poster_wall_and_not_coated_glass(tracer, site):
     assert loss["curtain"] < 2
 
 
+def test_presets_reach_the_scenes_of_sionna(tracer):
+    street, config = preset_of("28ghz").applied(scene_of("simple_street_canyon"), QUICK)
+    walls = [item for item in street.objects if item.material in SURFACES]
+    assert walls
+    assert all(item.alpha_r == SURFACES[item.material].alpha_r for item in walls)
+    (row,) = tracer.trace_each(street, None, street.receivers(1, seed=0), config)
+    assert row.frequency == 28e9
+    assert int((row.kind == 2).sum()) > 0
+
+
+def test_a_foreign_material_that_is_undefined_at_the_frequency_is_one_error(tracer):
+    box = scene_of("box")
+    with pytest.raises(InputError, match=r"scene 'box' has a material that is not defined at 200 GHz"):
+        next(tracer.trace_each(box, None, box.receivers(1, seed=0), QUICK, frequency=200e9))
+
+
 def test_refraction_is_off_unless_asked_for(tracer, site):
     scene, config = preset_of("transparent").applied(site, QUICK)
     only = replace(scene, objects=(scene["curtain"],))

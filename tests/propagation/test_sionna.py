@@ -9,6 +9,7 @@ from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.units import SPEED_OF_LIGHT, db_from_power, friis_gain
 from rf3dgs.propagation.config import TraceConfig
+from rf3dgs.propagation.llvm import mitsuba_variant
 from rf3dgs.propagation.scene import Scene
 from rf3dgs.propagation.scene_files import check_foreign_xml
 from rf3dgs.propagation.scenes import scene_of
@@ -67,17 +68,18 @@ def test_gain_is_the_mean_over_transmit_of_the_sum_over_receive_polarisations(tr
     box = scene_of("box", scattering=0.0)
     rx = Pose([[2.0, 1.0, 1.5]])
     (row,) = tracer.trace_each(box, None, rx, replace(QUICK, depth=2))
-    scene = rt.load_scene(rt.scene.box, merge_shapes=False)
-    scene.frequency = box.frequency
-    scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="VH")
-    scene.add(rt.Receiver("rx", rx.position[0].tolist()))
-    scene.add(rt.Transmitter("tx", box.tx.position.tolist()))
     total = 0.0
-    for polarization in ("V", "H"):
-        scene.tx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarization)
-        found = rt.PathSolver()(scene, max_depth=2, samples_per_src=20_000, refraction=False)
-        real, imaginary = found.a
-        total += 0.5 * float((torch.from_numpy(real.numpy()) ** 2 + torch.from_numpy(imaginary.numpy()) ** 2).sum())
+    with mitsuba_variant(tracer.VARIANT):
+        scene = rt.load_scene(rt.scene.box, merge_shapes=False)
+        scene.frequency = box.frequency
+        scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="VH")
+        scene.add(rt.Receiver("rx", rx.position[0].tolist()))
+        scene.add(rt.Transmitter("tx", box.tx.position.tolist()))
+        for polarization in ("V", "H"):
+            scene.tx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarization)
+            found = rt.PathSolver()(scene, max_depth=2, samples_per_src=20_000, refraction=False)
+            real, imaginary = found.a
+            total += 0.5 * float((torch.from_numpy(real.numpy()) ** 2 + torch.from_numpy(imaginary.numpy()) ** 2).sum())
     assert float(row.total_gain[0]) == pytest.approx(total, rel=1e-3)
 
 
@@ -245,6 +247,18 @@ def test_unsafe_scene_files_are_refused(tmp_path, text, message):
     with pytest.raises(DataError, match=message) as caught:
         check_foreign_xml(path)
     assert "scene.xml" in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["/etc/passwd", "../a.ply"])
+def test_a_scene_that_reads_other_folders_is_never_loaded(tmp_path, name):
+    (tmp_path / "site.xml").write_text(plain(f'<shape type="ply"><string name="filename" value="{name}"/></shape>'))
+    with pytest.raises(
+        DataError, match=r"site\.xml names the file .* only files in the scene's own folder may be read"
+    ):
+        scene_of(tmp_path / "site.xml")
+    (tmp_path / "site.xml").write_text(plain(f'<include filename="{name}"/>'))
+    with pytest.raises(DataError, match=r"site\.xml has a <include> element, which is refused"):
+        scene_of(tmp_path / "site.xml")
 
 
 def test_missing_scene_files_are_data_errors(tmp_path):

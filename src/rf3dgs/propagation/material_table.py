@@ -31,6 +31,11 @@ class MaterialTable(NamedTuple):
     objects: dict[str, dict[str, Any]]
 
 
+def has_table(folder: Path) -> bool:
+    """True for a folder that says what its meshes are made of."""
+    return any((folder / name).is_file() for name in TABLES)
+
+
 def read_table(folder: Path) -> MaterialTable:
     """The table in a folder; DataError, naming the file, when it is missing, damaged, incomplete or misspelt."""
     path = _table_in(folder)

@@ -79,6 +79,8 @@ def _raw(name: str, matrix: NDArray, mesh: Any) -> RawMesh:
     """One placed mesh with the vertices that its faces use."""
     faces = np.asarray(mesh.faces, dtype=np.int64)
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"a triangle names a vertex that does not exist ({len(vertices)} vertices)")
     used, faces = np.unique(faces, return_inverse=True)
     placed = vertices[used] @ np.asarray(matrix)[:3, :3].T + np.asarray(matrix)[:3, 3]
     faces = faces.reshape(-1, 3)

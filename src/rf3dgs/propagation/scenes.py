@@ -11,6 +11,7 @@ from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.propagation import meshes
 from rf3dgs.propagation.lobby import lobby
+from rf3dgs.propagation.material_table import has_table
 from rf3dgs.propagation.scene import Bounds, Scene, SceneObject
 from rf3dgs.propagation.scene_files import check_foreign_xml, lobe_of_name
 
@@ -60,7 +61,7 @@ def scene_of(name_or_xml: str | Path | Scene, *, scattering: float | None = None
     name = str(name_or_xml)
     if name in ("lobby", "lobby-full"):
         return lobby("plain" if name == "lobby" else "full")
-    if Path(name).is_dir():
+    if Path(name).is_dir() and (has_table(Path(name)) or Path(name).name != name):  # else a scene's name may be meant
         from rf3dgs.propagation.mesh_folder import read_mesh_folder
 
         return read_mesh_folder(Path(name))
