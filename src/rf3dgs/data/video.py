@@ -1,12 +1,9 @@
-"""Photographs out of a video: the sharpest frame of every so many, as a folder that `sfm.poses_from_photos` takes.
-
-Videos are decoded by PyAV, which the user installs (docs/how-to/photos.md says why it is no extra of this package).
-"""
+"""Photographs out of a video: the sharpest frame of every so many, as a folder that `sfm.poses_from_photos` takes."""
 
 import math
+import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +14,11 @@ from rf3dgs.core.files import atomic_folder
 from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.data.safe import MAX_PIXELS
 
-CONTAINERS = {".mp4": "mov", ".m4v": "mov", ".mov": "mov", ".mkv": "matroska", ".webm": "matroska", ".avi": "avi"}
-"""What each ending is read as; guessing from the content would open playlists, which name other files."""
+MP4, MATROSKA, RIFF = (4, b"ftyp"), (0, b"\x1aE\xdf\xa3"), (8, b"AVI ")
+CONTAINERS = {".mp4": MP4, ".m4v": MP4, ".mov": MP4, ".mkv": MATROSKA, ".webm": MATROSKA, ".avi": RIFF}
+"""Which bytes a file of each ending has, and where: a decoder that guesses would open playlists, which name files."""
+WHOLE = 0.9
+"""A video that ends before this part of the frames it promises is cut short."""
 MOST_PHOTOS = 5_000
 SHARPNESS_WIDTH = 320
 """Frames are compared at about this width [pixel]."""
@@ -37,7 +37,7 @@ def photos_of_video(
     every: frames of one photograph, half a second of a usual video by default. longest: pictures with a longer edge
     [pixel] are made smaller. A folder of that name must be empty or missing; it appears whole or not at all.
     Raises DataError for a video that is missing, damaged, of another kind or without pictures, InputError for values
-    out of range, MissingDependencyError without PyAV.
+    out of range, MissingDependencyError without OpenCV.
     """
     path, folder, progress = Path(path), Path(folder), progress or Silent()
     if every < 1 or longest < 16:
@@ -87,30 +87,40 @@ def _save(picture: NDArray[np.uint8], folder: Path, number: int, longest: int, p
 def _frames(path: Path) -> Iterator[NDArray[np.uint8]]:
     """The frames `[row, col, 3]` of a video, upright."""
     try:
-        import av
-        from av.error import FFmpegError
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # what it has to say is said by the errors below
+        import cv2
     except ImportError as error:
-        raise MissingDependencyError("videos need PyAV: pip install av") from error
+        raise MissingDependencyError("videos need OpenCV: pip install 'rf3dgs[video]'") from error
+    _check_container(path)
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        width, height = (capture.get(name) for name in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if not capture.isOpened() or width < 1 or height < 1:
+            raise DataError(f"{path}: the video is damaged or has no pictures; export it again")
+        if width * height > MAX_PIXELS:
+            raise DataError(f"{path}: has frames of {width:.0f}x{height:.0f} pixels; make them smaller")
+        promised, number = capture.get(cv2.CAP_PROP_FRAME_COUNT), 0
+        while True:
+            good, picture = capture.read()
+            if not good:
+                break
+            number += 1
+            yield np.ascontiguousarray(picture[..., ::-1])
+        if number < WHOLE * promised:
+            raise DataError(
+                f"{path}: the video is damaged after {number} of {promised:.0f} frames; copy or export it again"
+            )
+    finally:
+        capture.release()
+
+
+def _check_container(path: Path) -> None:
     if path.suffix.lower() not in CONTAINERS:
         raise DataError(f"{path}: expected a video ending in {', '.join(CONTAINERS)}")
     if not path.is_file():
         raise DataError(f"{path}: there is no such video")
-    try:
-        with path.open("rb") as file, av.open(file, "r", format=CONTAINERS[path.suffix.lower()]) as container:
-            if not container.streams.video:
-                raise DataError(f"{path}: has no pictures, only other streams")
-            stream = container.streams.video[0]
-            if stream.width * stream.height > MAX_PIXELS:
-                raise DataError(f"{path}: has frames of {stream.width}x{stream.height} pixels; make them smaller")
-            for frame in container.decode(stream):
-                if frame.width * frame.height > MAX_PIXELS:
-                    raise DataError(f"{path}: has frames of {frame.width}x{frame.height} pixels; make them smaller")
-                yield _upright(frame)
-    except (FFmpegError, ValueError, OSError) as error:
-        raise DataError(f"{path}: the video is damaged or of another kind ({error}); export it again") from error
-
-
-def _upright(frame: Any) -> NDArray[np.uint8]:
-    """The frame turned by what its display matrix says, which telephones use for upright videos."""
-    quarter_turns = round(getattr(frame, "rotation", 0) / 90) % 4
-    return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), quarter_turns))
+    place, mark = CONTAINERS[path.suffix.lower()]
+    with path.open("rb") as file:
+        start = file.read(16)
+    if start[place : place + len(mark)] != mark:
+        raise DataError(f"{path}: the video is damaged or of another kind than its name says; export it again")
