@@ -37,7 +37,7 @@ $(VENV)/package.stamp: $(VENV)/torch.stamp $(SOURCES)
 
 $(VENV)/test.stamp: $(VENV)/package.stamp
 	@PYTHON="$(PYTHON)" tools/system-packages.sh test
-	$(PIP) install -q -c constraints.txt -e ".[trace,sfm]" --group test --group lint
+	$(PIP) install -q -c constraints.txt -e ".[trace,sfm,cluster,mesh]" --group test --group lint
 	@touch $@
 
 demo: $(VENV)/package.stamp

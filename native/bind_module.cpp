@@ -11,6 +11,7 @@
 
 #include "bind.hpp"
 #include "bind_floor.hpp"
+#include "bind_spectra.hpp"
 #include "core/thread_pool.hpp"
 #include "splats/constants.hpp"
 #include "splats/kernels.hpp"
@@ -202,4 +203,5 @@ NB_MODULE(_native, m) {
   bind_loss(m);
   bind_trainer(m);
   bind_floor(m);
+  bind_spectra(m);
 }

@@ -453,7 +453,7 @@ IMPOSSIBLE = {
     "a field over a dataset": ("fit SITE --out SITE", "something else than a field"),
     "a demo over a file": ("demo --scene box --out PLY", "geometry.ply"),
     "a dataset without photographs": ("fit-geometry BARE --out OUT/g.ply", "no photographs"),
-    "negative receivers": ("trace lobby --rx-count -2 --out OUT/x.paths", "at least 1"),
+    "negative receivers": ("trace lobby --rx.count -2 --out OUT/x.paths", "count from 1"),
     "no photographs": ("photos lobby --count 0 --out OUT/photos", "at least 1"),
     "an array of no elements": ("spectra PATHS --out OUT/x --method capon --array 0x4", "rows x columns"),
     "noise without elements": ("spectra PATHS --out OUT/x --snr-db 10", "no elements"),

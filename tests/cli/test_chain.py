@@ -37,7 +37,7 @@ def box(tmp_path_factory) -> Path:
     pytest.importorskip("sionna.rt")
     folder = tmp_path_factory.mktemp("box")
     ideal, capon, paths = folder / "ideal", folder / "capon", folder / "box.paths"
-    assert main(["trace", "box", "--rx-count", "12", "--out", str(paths), *TRACE]) == 0
+    assert main(["trace", "box", "--rx.count", "12", "--out", str(paths), *TRACE]) == 0
     assert main(["photos", "box", "--count", "9", "--out", str(ideal / "photos"), *PHOTO]) == 0
     assert main(["spectra", str(paths), "--out", str(ideal), "--size", "48", "24"]) == 0
     array = ("--method", "capon", "--array", "4x4", "--snr-db", "20", "--grid", "pinhole", "--size", "24", "16")

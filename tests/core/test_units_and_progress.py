@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from rf3dgs.core.progress import Console, Silent, track
+from rf3dgs.core.progress import Console, Silent, duration, track
 from rf3dgs.core.units import SPEED_OF_LIGHT, db_from_power, friis_gain, power_from_db, wavelength
 
 
@@ -36,3 +36,14 @@ def test_progress_without_a_terminal_writes_plain_lines_of_at_most_79_columns() 
 def test_silent_progress_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(track(range(2), "x", 2, Silent())) == [0, 1]
     assert capsys.readouterr().out == ""
+
+
+def test_what_is_left_is_told_in_hours_where_it_takes_hours() -> None:
+    assert [duration(seconds) for seconds in (0.4, 59.4, 59.6, 3599, 3600, 50_700)] == [
+        "0 s",
+        "59 s",
+        "1 min 0 s",
+        "59 min 59 s",
+        "1 h 0 min",
+        "14 h 5 min",
+    ]

@@ -6,10 +6,10 @@ import torch
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import Camera, pinhole_grid
+from rf3dgs.core.grids import Camera, equirect_grid, pinhole_grid
 from rf3dgs.propagation import shapes
 from rf3dgs.propagation.config import PhotoConfig
-from rf3dgs.propagation.photographer import camera_tour, render_photos
+from rf3dgs.propagation.photographer import camera_tour, render_panorama, render_panoramas, render_photos
 from rf3dgs.propagation.scene import SceneObject
 
 QUICK = PhotoConfig(width=80, height=60, samples=8, bounces=3)
@@ -59,6 +59,50 @@ def test_left_is_left_and_up_is_up(marked):
     red, green, blue = (np.argwhere(photo[..., channel] > 150).mean(0) for channel in range(3))
     assert red[1] < 40 < green[1]
     assert blue[0] < red[0]
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+def test_a_panorama_overlays_a_spectrum_of_the_same_pose(marked, yaw):
+    pose = Pose.from_yaw((5.0, 7.2, 1.4), yaw)
+    photo = render_panorama(marked, pose, 180, QUICK)
+    assert photo.shape == (90, 180, 3)
+    assert photo.dtype == np.uint8
+    grid = equirect_grid(180, 90)
+    for channel, centre in enumerate(((10.0, 9.0, 1.5), (10.0, 6.0, 1.5), (10.0, 7.5, 2.8))):
+        own = photo[..., channel].astype(int)
+        rest = np.delete(photo, channel, axis=2).max(-1)
+        lamp = torch.from_numpy((own > 150) & (rest < 80))
+        mean = torch.nn.functional.normalize(grid.directions[lamp].mean(0), dim=-1)
+        towards = pose.to_device(torch.tensor(centre) - pose.position)
+        angle = torch.rad2deg(torch.acos((mean * towards).sum() / towards.norm()))
+        assert float(angle) < 1.5  # pixels are 2 degrees wide
+
+
+def test_panoramas_follow_each_other_with_seeds_of_their_own(marked):
+    poses = Pose([[5.0, 7.2, 1.4], [6.0, 7.2, 1.4]])
+    both = list(render_panoramas(marked, poses, 32, QUICK))
+    assert np.array_equal(both[0], render_panorama(marked, poses[0], 32, QUICK))
+    assert not np.array_equal(both[0], both[1])
+
+
+def test_panoramas_need_an_even_width_and_one_pose(site):
+    with pytest.raises(InputError, match="even width of at least 8 pixels"):
+        render_panorama(site, Pose((5.0, 7.0, 1.5)), 33)
+    with pytest.raises(InputError, match="a panorama stands at one pose"):
+        render_panorama(site, Pose([[5.0, 7.0, 1.5]]), 32)
+
+
+def test_light_passes_a_glass_partition(tracer, marked):
+    vertices, faces, _ = shapes.quad((8.0, 4.0, 3.4), (0.0, 7.0, 0.0), (0.0, 0.0, -3.4))
+    pane = SceneObject("pane", vertices, faces, "glass", 0.1, colour=(0.05, 0.05, 0.05))
+    camera = Camera.of(Pose.look_at((5.0, 7.5, 1.4), (10.0, 7.5, 1.4)), pinhole_grid(80, 60, 80.0))
+    red = {}
+    for transparency in (0.0, 0.9):
+        scene = replace(marked, objects=(*marked.objects, replace(pane, transparency=transparency)))
+        (photo,) = render_photos(scene, [camera], QUICK)
+        red[transparency] = int((photo[..., 0] > 120).sum())
+    assert red[0.0] == 0
+    assert red[0.9] > 10
 
 
 def test_the_lobby_is_well_exposed_and_the_same_on_every_run(site, tracer):

@@ -8,7 +8,7 @@ from rf3dgs.channel.binning import stack_paths
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import equirect_grid
-from rf3dgs.spectra.codec import DbWindow, PaperEncoding, first_arrival, window_of
+from rf3dgs.spectra.codec import DbWindow, PaperEncoding, PerViewLinear, first_arrival, paper_scale, window_of
 from rf3dgs.spectra.scan import spectrum_of
 
 SPHERE = equirect_grid(120, 60)
@@ -88,3 +88,19 @@ def test_the_papers_encoding_needs_delay_and_aod(spectra):
         PaperEncoding.of(replace(spectra, delay=None))
     with pytest.raises(InputError, match="needs spectra with aod"):
         PaperEncoding(DbWindow(-150, -80), 1e-7).encode(replace(spectra, aod=None))
+
+
+def test_each_view_is_linear_below_its_own_peak(spectra):
+    value = PerViewLinear().encode(spectra.power)
+    assert torch.equal(value.amax((-2, -1)), torch.ones(3))
+    assert torch.allclose(PerViewLinear().decode(value, spectra.power.amax((-2, -1))), spectra.power, rtol=1e-6)
+    louder = PerViewLinear().encode(1000.0 * spectra.power)
+    assert torch.allclose(louder, value, rtol=1e-6)
+    assert float(PerViewLinear().encode(torch.zeros(2, 4, 5)).abs().max()) == 0.0
+
+
+def test_the_papers_scale_depends_on_the_method(spectra):
+    for method in ("bartlett", "tapered"):
+        assert isinstance(paper_scale(replace(spectra, method=method)), PerViewLinear)
+    for method in ("ideal", "capon", "music"):
+        assert isinstance(paper_scale(replace(spectra, method=method)), DbWindow)

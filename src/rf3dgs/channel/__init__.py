@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rf3dgs.channel.response import cfr as cfr
     from rf3dgs.channel.response import cir as cir
     from rf3dgs.channel.response import manifold as manifold
+    from rf3dgs.channel.sounding import Sounding as Sounding
 
 _HOMES = {
     "Paths": ".paths",
@@ -35,6 +36,7 @@ _HOMES = {
     "load_paths": ".io",
     "PathsWriter": ".io",
     "PathsReader": ".io",
+    "Sounding": ".sounding",
 }
 __all__ = [  # noqa: RUF022 (reading order)
     "Paths",
@@ -51,5 +53,6 @@ __all__ = [  # noqa: RUF022 (reading order)
     "load_paths",
     "PathsWriter",
     "PathsReader",
+    "Sounding",
 ]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -1,17 +1,14 @@
-"""Paths in HDF5: ragged columns, one offset per receiver, conventions as attributes.
+"""Writing and reading paths: one HDF5 file (`paths_file` says its layout), or a folder of such files.
 
-Layout, version 1. `offset` `[rx + 1]`: the paths of receiver i are the entries `offset[i]` to `offset[i + 1]` of every
-column. Columns: `coeff_real`, `coeff_imag`, `delay` [s], `aoa_zenith`, `aoa_azimuth`, `aod_zenith`, `aod_azimuth`
-[rad], and, where known, `order` and `kind`. `rx_position` `[rx, 3]` [m], `rx_orientation` `[rx, 4]` (wxyz). The columns
-are compressed by gzip and shuffle; every dataset carries fletcher32 checksums, and the file format of HDF5 1.10 has
-checksums of everything else, so that damage is noticed. Text attributes are fixed-length UTF-8. Any program with HDF5
-1.10 or later reads such a file, MATLAB with `h5read`.
+A folder holds `manifest.json` (`core.manifest`) and the shards `00000.h5`, `00001.h5`, ...: files of paths whose `meta`
+carries the digest of the manifest as `set` and the number of the first receiver as `first`.
 """
 
 import json
-import math
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
+from io import BytesIO
 from pathlib import Path
 from types import TracebackType
 
@@ -21,23 +18,12 @@ import torch
 
 from rf3dgs.channel.binning import stack_paths
 from rf3dgs.channel.paths import Paths
+from rf3dgs.channel.paths_file import CHUNK, CONVENTIONS, FLOATS, INTEGERS, SCHEMA, VERSION, PathsFile
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.files import atomic_file
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.hdf5 import LIBVER, open_audited, read_array, read_attribute, write_text
-from rf3dgs.core.units import LONGEST_DELAY, shortest_delay
-
-SCHEMA = "rf3dgs.paths"
-VERSION = 1
-CHUNK = 65_536
-FLOATS = ("coeff_real", "coeff_imag", "delay", "aoa_zenith", "aoa_azimuth", "aod_zenith", "aod_azimuth")
-INTEGERS = ("order", "kind")
-CONVENTIONS = {
-    "units": "m, s, Hz, rad, linear amplitude",
-    "frames": "world: right-handed, z up; device: x forward, y left, z up; quaternion wxyz of world_from_device",
-    "angles": "zenith from +z in [0, pi], azimuth from +x towards +y in (-pi, pi]; aoa seen from rx, aod from tx",
-    "phase": "exp(+j 2 pi f t); coeff without the carrier's exp(-j 2 pi f delay); |coeff|^2 is the path gain",
-}
+from rf3dgs.core.hdf5 import LIBVER, write_text
+from rf3dgs.core.manifest import Manifest, load_manifest
 
 
 class PathsWriter:
@@ -46,23 +32,30 @@ class PathsWriter:
     Use it in a `with` statement: the file appears under its name when the block ends well and not at all otherwise.
     """
 
-    def __init__(self, path: str | Path, frequency: float, tx: Pose, meta: Mapping[str, object] | None = None) -> None:
-        """Open `path` for paths at `frequency` [Hz] from `tx` (one pose); `meta` is what JSON can hold in 60 kB."""
+    def __init__(
+        self, path: str | Path | BytesIO, frequency: float, tx: Pose, meta: Mapping[str, object] | None = None
+    ) -> None:
+        """Open `path` for paths at `frequency` [Hz] from `tx` (one pose); `meta` is what JSON can hold in 60 kB.
+
+        An empty `BytesIO` in place of a path gets the bytes of the file. The same paths give the same bytes.
+        """
         if tx.batch_shape:
             raise InputError(f"tx must be one pose; got {list(tx.batch_shape)} of them")
-        self.path = Path(path)
+        self.path = path if isinstance(path, BytesIO) else Path(path)
         self.frequency = float(frequency)
         self.tx = tx
         self._meta = json.dumps(dict(meta or {}), allow_nan=False)
         self._stack = ExitStack()
         self._file: h5py.File | None = None
-        self._columns: tuple[str, ...] = ()
+        self._columns: dict[str, h5py.Dataset] = {}
         self._offset = [0]
         self._rx: list[Pose] = []
+        self._traced: list[int | None] = []
 
     def __enter__(self) -> "PathsWriter":
         with ExitStack() as stack:
-            temporary = stack.enter_context(atomic_file(self.path))
+            target = self.path
+            temporary = target if isinstance(target, BytesIO) else stack.enter_context(atomic_file(target))
             file = stack.enter_context(h5py.File(temporary, "w", libver=LIBVER))
             for name, text in {**CONVENTIONS, "schema": SCHEMA, "meta": self._meta}.items():
                 write_text(file.attrs, name, text)
@@ -71,11 +64,14 @@ class PathsWriter:
             self._file, self._stack = file, stack.pop_all()
         return self
 
-    def append(self, paths: Paths) -> None:
-        """Add the valid paths of one receiver (no batch) or of several `[rx, path]`."""
+    def append(self, paths: Paths, *, traced: int | None = None) -> None:
+        """Add the valid paths of one receiver (no batch) or of several `[rx, path]`.
+
+        traced: how many paths the tracer found for each of these receivers, before diffuse ones were merged.
+        """
         if paths.coeff.dim() == 2:
             for index in range(len(paths.rx)):
-                self.append(paths[index])
+                self.append(paths[index], traced=traced)
             return
         if self._file is None:
             raise InputError(f"the writer of {self.path} is not open; use it in a with statement")
@@ -92,19 +88,16 @@ class PathsWriter:
         if not all(np.isfinite(value).all() for value in columns.values()):
             raise InputError(f"paths for {self.path} have NaN or infinite values; mark such entries as not valid")
         if not self._columns:
-            self._columns = tuple(columns)
-            for name, value in columns.items():
-                self._create(name, value.dtype)
-        if tuple(columns) != self._columns:
-            raise InputError(f"{self.path} holds the columns {self._columns}; got {tuple(columns)}")
+            self._columns = {name: self._create(name, value.dtype) for name, value in columns.items()}
+        if list(columns) != list(self._columns):
+            raise InputError(f"{self.path} holds the columns {tuple(self._columns)}; got {tuple(columns)}")
         end = self._offset[-1] + len(columns["delay"])
         for name, value in columns.items():
-            dataset = self._file[name]
-            assert isinstance(dataset, h5py.Dataset)
-            dataset.resize((end,))
-            dataset[self._offset[-1] :] = value
+            self._columns[name].resize((end,))
+            self._columns[name][self._offset[-1] :] = value
         self._offset.append(end)
         self._rx.append(paths.rx)
+        self._traced.append(traced)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -117,9 +110,9 @@ class PathsWriter:
             raise
         self._stack.__exit__(kind, error, trace)
 
-    def _create(self, name: str, dtype: np.dtype) -> None:
+    def _create(self, name: str, dtype: np.dtype) -> h5py.Dataset:
         assert self._file is not None
-        self._file.create_dataset(
+        return self._file.create_dataset(
             name,
             shape=(0,),
             maxshape=(None,),
@@ -134,6 +127,10 @@ class PathsWriter:
     def _finish(self) -> None:
         assert self._file is not None
         file = self._file
+        # Space in the file is given out when a dataset is flushed. Left to the moment when Python drops the dataset,
+        # which a profiler or a debugger may put off, the same paths would make files of different bytes.
+        for dataset in self._columns.values():
+            dataset.flush()
         if not self._rx:
             raise InputError(f"no receiver was written to {self.path}; append the paths of at least one")
         head = {
@@ -143,8 +140,11 @@ class PathsWriter:
             "tx_position": self.tx.position.numpy(),
             "tx_orientation": self.tx.orientation.numpy(),
         }
+        traced = [number for number in self._traced if number is not None]
+        if len(traced) == len(self._rx):
+            head["rx_traced"] = np.asarray(traced, dtype=np.int64)
         for name, value in head.items():
-            file.create_dataset(name, data=value, fletcher32=True)
+            file.create_dataset(name, data=value, fletcher32=True).flush()
 
 
 def _columns(paths: Paths) -> dict[str, np.ndarray]:
@@ -172,103 +172,89 @@ def load_paths(path: str | Path) -> Paths:
         return stack_paths(list(reader))
 
 
-class PathsReader:
-    """The receivers of a file of paths, read one at a time; `len`, indexing, iteration and `with`.
+def shard_name(number: int) -> str:
+    """The file of shard `number` in a folder of paths."""
+    return f"{number:05d}.h5"
 
-    `meta` is what the writer was given; `frequency` [Hz]; `tx` one pose; `rx` `[rx]` poses.
+
+class PathsReader:
+    """The receivers of a file of paths, or of a folder of such files, read one at a time.
+
+    Has `len`, indexing, iteration and `with`. `meta` is what the writer was given (of a folder: what the set is made
+    from and by); `frequency` [Hz]; `tx` one pose; `rx` `[rx]` poses; `traced` `[rx]` numbers of paths before diffuse
+    ones were merged, or None. Of a folder one shard is open at a time.
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Open and audit `path`; DataError names it when it is damaged, unsafe or something else."""
+        """Open and audit `path`; DataError names it when it is damaged, unsafe, not complete or something else."""
         self.path = Path(path)
-        self._file = open_audited(self.path)
-        try:
-            self._read_head()
-        except BaseException:
-            self._file.close()
-            raise
-
-    def _read_head(self) -> None:
-        file = self._file
-        try:
-            if "schema" not in file.attrs or read_attribute(file, "schema") != SCHEMA:
-                raise DataError(
-                    f"{self.path}: expected a file of paths with schema {SCHEMA!r}; it holds something else"
-                )
-            version = read_attribute(file, "version")
-            if version != VERSION:
-                raise DataError(f"{self.path}: schema version {version} is not {VERSION}; update rf3dgs to read it")
-            self.frequency = float(read_attribute(file, "frequency"))
-            self.meta: dict = json.loads(str(read_attribute(file, "meta")))
-            self._offset = read_array(file, "offset").astype(np.int64)
-            self.tx = Pose(*self._pose("tx", ()))
-            self.rx = Pose(*self._pose("rx", (len(self._offset) - 1,)))
-        except (InputError, ValueError, TypeError, OSError, RuntimeError) as error:
-            raise DataError(f"{self.path}: its head is damaged ({error}); write it again") from error
-        offset = self._offset
-        if offset.ndim != 1 or len(offset) < 2 or offset[0] != 0 or bool((np.diff(offset) < 0).any()):
-            raise DataError(f"{self.path}: 'offset' must rise from 0 with one entry per receiver and one more")
-        names = [*FLOATS, *(name for name in INTEGERS if name in file)]
-        self._datasets: dict[str, h5py.Dataset] = {}
-        for name in names:
-            dataset = file.get(name)
-            if not isinstance(dataset, h5py.Dataset) or dataset.shape != (offset[-1],):
-                raise DataError(f"{self.path}: the column {name!r} must have {offset[-1]} entries; it does not")
-            self._datasets[name] = dataset
-
-    def _pose(self, name: str, batch: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
-        position = read_array(self._file, f"{name}_position")
-        orientation = read_array(self._file, f"{name}_orientation")
-        if position.shape != (*batch, 3) or orientation.shape != (*batch, 4):
-            raise DataError(
-                f"{self.path}: {name}_position and {name}_orientation must be {[*batch, 3]} and {[*batch, 4]}"
-            )
-        return torch.from_numpy(position.astype(np.float32)), torch.from_numpy(orientation.astype(np.float32))
+        self._manifest = _complete(self.path) if self.path.is_dir() else None
+        self._number = 0
+        if self._manifest is None:
+            self._file = PathsFile(self.path)
+            self.meta = self._file.meta
+        else:
+            self._file = self._shard(self._manifest, 0)
+            self.meta = {"made_from": dict(self._manifest.made_from), "made_by": dict(self._manifest.made_by)}
+        self.frequency, self.tx = self._file.frequency, self._file.tx
+        self._heads: tuple[Pose, np.ndarray | None] | None = None
 
     def __len__(self) -> int:
-        return len(self._offset) - 1
+        return len(self._file) if self._manifest is None else self._manifest.count
 
     def __getitem__(self, index: int) -> Paths:
         """The paths of one receiver `[path]`."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"{self.path} has {len(self)} receivers; there is no number {index}")
         index %= len(self)
-        part = slice(int(self._offset[index]), int(self._offset[index + 1]))
-        columns = {name: self._column(name, part) for name in self._datasets}
-        self._check_units(columns, index)
-        coeff = torch.complex(columns.pop("coeff_real"), columns.pop("coeff_imag"))
-        valid = torch.ones(coeff.shape, dtype=torch.bool)
-        return Paths(coeff=coeff, **columns, valid=valid, frequency=self.frequency, tx=self.tx, rx=self.rx[index])
+        if self._manifest is None:
+            return self._file[index]
+        number = self._manifest.shard_of(index)
+        if number != self._number:
+            self._file.close()
+            self._file, self._number = self._shard(self._manifest, number), number
+        return self._file[index - self._manifest.part(number).start]
 
-    def _column(self, name: str, part: slice) -> torch.Tensor:
-        try:
-            value = np.asarray(self._datasets[name][part])
-        except (OSError, RuntimeError, ValueError) as error:
-            raise DataError(f"{self.path}: {name!r} is damaged (checksum or storage); write the file again") from error
-        if name in INTEGERS:
-            return torch.from_numpy(value.astype(np.int8))
-        if not np.isfinite(value).all():
-            raise DataError(f"{self.path}: {name!r} has NaN or infinite values; write the file again")
-        return torch.from_numpy(value.astype(np.float32))
+    @property
+    def rx(self) -> Pose:
+        """The poses `[rx]` of all receivers; of a folder, the head of every shard is read once."""
+        return self._all_heads()[0]
 
-    def _check_units(self, columns: Mapping[str, torch.Tensor], index: int) -> None:
-        """Refuse angles beyond a full turn, and delays that light does not have over the distance."""
-        if not len(columns["delay"]):
-            return
-        for name, limit in {"aoa_zenith": 1, "aoa_azimuth": 2, "aod_zenith": 1, "aod_azimuth": 2}.items():
-            largest = float(columns[name].abs().max())
-            if largest > limit * math.pi + 1e-3:
-                raise DataError(
-                    f"{self.path}: {name!r} of receiver {index} reaches {largest:.4g}, expected at most {limit} pi "
-                    "radians; it is in degrees, convert it to radians"
-                )
-        first, last = float(columns["delay"].min()), float(columns["delay"].max())
-        distance = float(torch.linalg.vector_norm(self.rx[index].position - self.tx.position))
-        if last > LONGEST_DELAY or first < shortest_delay(distance):
-            raise DataError(
-                f"{self.path}: receiver {index}, {distance:.4g} m from the transmitter, has delays from {first:.3g} to "
-                f"{last:.3g} s, which light does not; positions must be in metres and delays in seconds, convert them"
+    @property
+    def traced(self) -> np.ndarray | None:
+        """How many paths `[rx]` the tracer found before diffuse ones were merged; None where that is not known."""
+        return self._all_heads()[1]
+
+    def _all_heads(self) -> tuple[Pose, np.ndarray | None]:
+        if self._manifest is None:
+            return self._file.rx, self._file.traced
+        if self._heads is None:
+            poses, traced = [], []
+            for number in range(self._manifest.shards):
+                file = self._shard(self._manifest, number)
+                file.close()
+                poses.append(file.rx)
+                traced.append(file.traced)
+            position, orientation = (
+                torch.cat([getattr(p, name) for p in poses]) for name in ("position", "orientation")
             )
+            known = [part for part in traced if part is not None]
+            self._heads = Pose(position, orientation), np.concatenate(known) if len(known) == len(traced) else None
+        return self._heads
+
+    def _shard(self, manifest: Manifest, number: int) -> PathsFile:
+        """Open one shard; DataError when it is another set's."""
+        file = PathsFile(self.path / shard_name(number))
+        part = manifest.part(number)
+        own = (file.meta.get("set"), file.meta.get("first"), len(file)) == (manifest.digest, part.start, len(part))
+        first = not hasattr(self, "tx") or (file.frequency == self.frequency and _same(file.tx, self.tx))
+        if not (own and first):
+            file.close()
+            raise DataError(
+                f"{file.path} does not belong to this set: another run wrote it; delete it and run the same "
+                "rf3dgs trace command again"
+            )
+        return file
 
     def __iter__(self) -> Iterator[Paths]:
         return (self[index] for index in range(len(self)))
@@ -282,3 +268,23 @@ class PathsReader:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def _complete(folder: Path) -> Manifest:
+    """The manifest of a folder that has all of its shards."""
+    manifest = load_manifest(folder)
+    if manifest.schema != SCHEMA:
+        raise DataError(f"{folder}: expected a folder of paths with schema {SCHEMA!r}; it holds {manifest.schema!r}")
+    names = (item.name for item in folder.iterdir())
+    numbers = {int(name.removesuffix(".h5")) for name in names if re.fullmatch(r"\d{5,9}\.h5", name)}
+    there = sum(number < manifest.shards for number in numbers)
+    if there < manifest.shards:
+        raise DataError(
+            f"{folder} has {there} of {manifest.shards} shards; run the same rf3dgs trace command again, which makes "
+            "the missing ones"
+        )
+    return manifest
+
+
+def _same(one: Pose, other: Pose) -> bool:
+    return torch.equal(one.position, other.position) and torch.equal(one.orientation, other.orientation)

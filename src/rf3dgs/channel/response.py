@@ -25,6 +25,31 @@ def manifold(array: PlanarArray, directions: Tensor) -> Tensor:
     return torch.polar(field_pattern(array.pattern, directions)[..., None].expand_as(phase).contiguous(), phase)
 
 
+def manifold_factors(array: PlanarArray, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """The manifold without the element's gain as a product: factors `[col, n]` and `[row, n]`, complex128.
+
+    directions `[n, 3]`, device frame. a[row + col * rows] = sqrt(G) column[col] row[row]: rows + cols phasors for a
+    direction instead of rows * cols.
+    """
+    _, y, z = directions.double().unbind(-1)
+    columns = phasors(array.horizontal * y, -(array.cols - 1) / 2, array.cols)
+    return columns, phasors(-array.vertical * z, -(array.rows - 1) / 2, array.rows)
+
+
+def phasors(turn: Tensor, first: float, count: int) -> Tensor:
+    """e^{j 2 pi turn (first + i)} `[count, n]`, complex128, for i below `count`; `turn` `[n]`, float64.
+
+    One multiplication leads from each to the next: the error grows by one rounding a step.
+    """
+    one = torch.ones_like(turn)
+    step = torch.polar(one, 2 * math.pi * turn)
+    result = torch.empty(count, len(turn), dtype=torch.complex128)
+    result[0] = torch.polar(one, 2 * math.pi * first * turn) if first else 1.0
+    for index in range(1, count):
+        torch.mul(result[index - 1], step, out=result[index])
+    return result
+
+
 def coefficients(paths: Paths, phase: Phase = "carrier", *, seed: int = 0) -> Tensor:
     """Complex path coefficients `[*batch, path]`, complex128, zero where not valid, with the chosen phase.
 

@@ -13,7 +13,7 @@ from rf3dgs.channel.paths import Paths
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid
-from rf3dgs.core.progress import Progress
+from rf3dgs.core.progress import Progress, track
 from rf3dgs.data.dataset import Dataset, Part
 from rf3dgs.data.photo import Photo
 from rf3dgs.data.split import every_kth
@@ -29,6 +29,7 @@ from rf3dgs.training.photographs import render_photo
 
 if TYPE_CHECKING:
     from rf3dgs.field.radio_field import RadioField
+    from rf3dgs.propagation.photo_job import Shot
     from rf3dgs.propagation.scene import Scene
 
 HOLD_OUT_EVERY = 7
@@ -49,26 +50,43 @@ def spectra_of_scene(
     return stack_spectra([spectrum(paths) for paths in trace_each(scene, scene.tx, rx, config, progress)])
 
 
+def shots_of_tour(scene: "Scene", count: int, seed: int, config: PhotoConfig) -> "list[Shot]":
+    """A walk through the scene, photograph by photograph; what is held out may have more light paths a pixel.
+
+    Held-out photographs and the others count their seeds on their own.
+    """
+    from rf3dgs.propagation.photo_job import Shot
+    from rf3dgs.propagation.photographer import camera_tour
+
+    clean = replace(config, samples=config.held_out_samples or config.samples, seed=config.seed + count)
+    taken = {"test": 0}
+    shots = []
+    for camera, role in zip(camera_tour(scene, count, seed, config), every_kth(count, HOLD_OUT_EVERY), strict=True):
+        how = clean if role == "test" else config
+        place = taken.get(role, 0)
+        shots.append(Shot(camera, replace(how, seed=how.seed + place)))
+        taken[role] = place + 1
+    return shots
+
+
+def photos_of(shots: "Sequence[Shot]", folder: Path) -> list[Photo]:
+    """The photographs of these shots, whose files lie in `folder`."""
+    from rf3dgs.propagation.photo_job import photo_name
+
+    names = [photo_name(number) for number in range(len(shots))]
+    return [Photo(name, shot.camera, folder / name) for name, shot in zip(names, shots, strict=True)]
+
+
 def photograph(
     scene: "Scene", count: int, seed: int, config: PhotoConfig, folder: Path, progress: Progress
 ) -> list[Photo]:
-    """Render a tour of the scene into JPEG files in `folder`; what is held out may have more light paths a pixel."""
-    from PIL import Image
+    """Render a tour of the scene into JPEG files in `folder`."""
+    from rf3dgs.propagation.photo_job import photo_name, take
 
-    from rf3dgs.propagation.photographer import camera_tour, render_photos
-
-    cameras = camera_tour(scene, count, seed, config)
-    held_out = [role == "test" for role in every_kth(count, HOLD_OUT_EVERY)]
-    clean = replace(config, samples=config.held_out_samples or config.samples, seed=config.seed + count)
-    photos: dict[int, Photo] = {}
-    for judge, how in ((True, clean), (False, config)):
-        numbers = [number for number in range(count) if held_out[number] == judge]
-        pictures = render_photos(scene, [cameras[number] for number in numbers], how, progress)
-        for number, picture in zip(numbers, pictures, strict=True):
-            name = f"{number:05d}.jpg"
-            Image.fromarray(picture).save(folder / name, quality=95, subsampling=0)
-            photos[number] = Photo(name, cameras[number], folder / name)
-    return [photos[number] for number in range(count)]
+    shots = shots_of_tour(scene, count, seed, config)
+    for number, content in track(take(scene, shots, lambda: None), "photographs", count, progress):
+        (folder / photo_name(number)).write_bytes(content)
+    return photos_of(shots, folder)
 
 
 def make_dataset(

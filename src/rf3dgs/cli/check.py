@@ -19,7 +19,7 @@ class Info:
     """Say what a field, a dataset, a file of paths or a .ply holds."""
 
     path: tyro.conf.Positional[Path]
-    """A .field folder, a dataset folder, a .paths file or a .ply file."""
+    """A .field folder, a dataset folder, a file or folder of paths, or a .ply file."""
 
     def run(self) -> int:
         """Print the facts as lines of name and value."""

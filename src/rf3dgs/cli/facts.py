@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rf3dgs.core import manifest
 from rf3dgs.core.errors import DataError, InputError
 
 if TYPE_CHECKING:
@@ -50,13 +51,15 @@ def open_scene(name: str) -> "Scene":
 
 
 def facts_of(path: Path) -> dict[str, str]:
-    """Names and values about a field, dataset, paths file or .ply."""
+    """Names and values about a field, a dataset, a file or folder of paths, or a .ply."""
     if str(path) == "lobby" and not path.exists():
         return _field_facts("lobby")
     if not path.exists():
         raise InputError(f"{path}: there is no such file or folder")
     if (path / "field.json").exists():
         return _field_facts(path)
+    if (path / manifest.NAME).exists() and manifest.load_manifest(path).schema == "rf3dgs.paths":
+        return _paths_facts(path)
     if path.is_dir():
         return _dataset_facts(path)
     if path.suffix == ".ply":
@@ -66,7 +69,7 @@ def facts_of(path: Path) -> dict[str, str]:
         return {"kind": "Gaussians", "count": f"{len(gaussians):,}", "harmonics degree": str(gaussians.degree)}
     if path.suffix in (".paths", ".h5", ".hdf5"):
         return _paths_facts(path)
-    raise DataError(f"{path}: expected a .field folder, a dataset folder, a .paths file or a .ply file")
+    raise DataError(f"{path}: expected a .field folder, a dataset folder, a file or folder of paths, or a .ply file")
 
 
 def _field_facts(path: str | Path) -> dict[str, str]:

@@ -13,6 +13,7 @@ from rf3dgs import __version__
 from rf3dgs.cli.ask import Csi, Render, View
 from rf3dgs.cli.check import Doctor, Info, Validate
 from rf3dgs.cli.demo import Demo
+from rf3dgs.cli.exchange import Export, Import
 from rf3dgs.cli.fit import Fit, FitGeometry, FitRadio
 from rf3dgs.cli.judge import Eval
 from rf3dgs.cli.make import MakePhotos, Trace
@@ -26,6 +27,8 @@ Command = (
     | Annotated[Trace, name("trace")]
     | Annotated[MakePhotos, name("photos")]
     | Annotated[MakeSpectra, name("spectra")]
+    | Annotated[Import, name("import")]
+    | Annotated[Export, name("export")]
     | Annotated[Fit, name("fit")]
     | Annotated[FitGeometry, name("fit-geometry")]
     | Annotated[FitRadio, name("fit-radio")]
@@ -70,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         complain(str(error))
         return 2
     except KeyboardInterrupt:
-        complain("interrupted; a started training run resumes from its last checkpoint")
+        complain("interrupted; the same command again goes on with what takes long: tracing, photographs, training")
         return 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

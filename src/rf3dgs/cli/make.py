@@ -1,95 +1,143 @@
 """`trace` and `photos`: from a scene to its paths and its photographs."""
 
-import re
-from dataclasses import dataclass, field
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from rf3dgs.cli.show import console, out
 from rf3dgs.core.errors import InputError
-from rf3dgs.propagation.config import PhotoConfig, TraceConfig
+from rf3dgs.propagation.config import PhotoConfig, ReceiverConfig, TraceConfig
+
+if TYPE_CHECKING:
+    from rf3dgs.propagation.jobs import Crew
+
+Preset = Literal["paper", "diffuse", "realistic", "28ghz", "10ghz", "2.4ghz", "transparent"]
 
 
 @dataclass(frozen=True)
 class Trace:
-    """Trace the paths from the transmitter to many receivers with Sionna RT."""
+    """Trace the paths from the transmitter to many receivers with Sionna RT; a killed run goes on where it stopped."""
 
     scene: tyro.conf.Positional[str]
-    """"lobby", a scene that ships with Sionna RT ("box", "simple_street_canyon"), or a Sionna/Mitsuba XML file."""
-    rx_count: int = 72
-    """Receivers, drawn in the free space of the scene."""
-    rx_seed: int = 0
-    """Decides where the receivers stand."""
+    """"lobby", "lobby-full" (more furniture), a scene that ships with Sionna RT ("box", "simple_street_canyon"), a
+    Sionna/Mitsuba XML file, or a folder of meshes."""
     out: Path = Path("lobby.paths")
-    """The HDF5 file to write; a killed run leaves none."""
+    """The folder to write: a manifest and shards in HDF5; the same command again makes what is missing."""
+    preset: Preset | None = None
+    """Frequency, scattering and what rays do, by name; the scene's own without. "paper" is "diffuse" for 800 receivers
+    with at least 300,000 paths each."""
+    rx: ReceiverConfig = field(default_factory=ReceiverConfig)
+    """Where receivers stand."""
     trace: TraceConfig = field(default_factory=TraceConfig)
     """How paths are traced."""
+    shard_size: int = 25
+    """Receivers in one shard, which is what a killed run may have to do again."""
+    workers: int = 1
+    """Processes on this machine; more than one needs the extra "cluster"."""
+    cluster: str | None = None
+    """The address of a dask scheduler, such as tcp://10.0.0.5:8786, whose workers do the tracing."""
 
     def run(self) -> int:
-        """Trace one receiver after the other; memory stays flat."""
-        import math
-
-        from rf3dgs.channel.binning import bin_diffuse
-        from rf3dgs.channel.io import PathsWriter
+        """Trace what the folder lacks, and say how large it is."""
+        from rf3dgs.channel.io import PathsReader
         from rf3dgs.cli.facts import open_scene
-        from rf3dgs.propagation.sionna import trace_each
+        from rf3dgs.propagation.jobs import run_job
+        from rf3dgs.propagation.presets import preset_of
+        from rf3dgs.propagation.receivers import receivers_of
+        from rf3dgs.propagation.scene import without_looks
+        from rf3dgs.propagation.trace_job import TraceJob
 
-        if self.rx_count < 1:
-            raise InputError(f"--rx-count must be at least 1; got {self.rx_count}")
-        scene = open_scene(self.scene)
-        rx = scene.receivers(self.rx_count, self.rx_seed)
-        frequency = self.trace.frequency or scene.frequency
-        meta = {"scene": scene.name, "rays": self.trace.rays, "seed": self.trace.seed, "rx_seed": self.rx_seed}
-        cell = math.radians(self.trace.cell_deg)
-        with PathsWriter(self.out, frequency, scene.tx, meta) as writer:
-            for paths in trace_each(scene, scene.tx, rx, self.trace, console()):
-                writer.append(bin_diffuse(paths, cell=cell, delay_step=self.trace.delay_step))
-        out(f"{self.out}: {self.rx_count} receivers, {self.out.stat().st_size / 1e6:.1f} MB")
+        _at_least_one(("--shard-size", self.shard_size), ("--workers", self.workers))
+        crew = _crew(self.workers, self.cluster)
+        scene, config, preset = open_scene(self.scene), self.trace, None
+        where = self.rx
+        if self.preset is not None:
+            preset = preset_of(self.preset)
+            scene, config = preset.applied(scene, config)
+            where = replace(where, count=where.count or preset.rx_count)
+        rx = receivers_of(scene, where)
+        job = TraceJob(
+            scene=self.scene if preset is None else without_looks(scene),
+            tx=scene.tx,
+            rx=rx,
+            frequency=config.frequency or scene.frequency,
+            config=config,
+            rule=asdict(where),
+            min_paths=preset.min_paths if preset else 0,
+            shard_size=self.shard_size,
+        )
+        run_job(job, self.out, crew=crew, progress=console())
+        with PathsReader(self.out) as reader:
+            traced = reader.traced
+        size = sum(item.stat().st_size for item in self.out.iterdir())
+        least = "" if traced is None else f", at least {int(traced.min()):,} paths each before diffuse ones are merged"
+        out(f"{self.out}: {len(rx)} receivers{least}, {size / 1e6:.1f} MB")
         return 0
 
 
 @dataclass(frozen=True)
 class MakePhotos:
-    """Render posed photographs of a scene with Mitsuba, in nerfstudio's layout."""
+    """Render posed photographs of a scene with Mitsuba, in nerfstudio's layout; a killed run goes on."""
 
     scene: tyro.conf.Positional[str]
-    """"lobby", a scene that ships with Sionna RT, or a Sionna/Mitsuba XML file."""
+    """"lobby", "lobby-full", a scene that ships with Sionna RT, a Sionna/Mitsuba XML file, or a folder of meshes."""
+    preset: Preset | None = None
+    """As of trace: some presets change what stands in the scene, and how it looks."""
     count: int = 60
     """Photographs."""
     tour_seed: int = 0
     """Decides where the cameras stand."""
     out: Path = Path("lobby/photos")
-    """The folder to write: pictures and transforms.json; a tour already there is replaced."""
+    """The folder to write: pictures, a manifest, and transforms.json at the end."""
     photo: PhotoConfig = field(default_factory=PhotoConfig)
     """How photographs are rendered."""
+    shard_size: int = 10
+    """Photographs in one shard, which is what a killed run may have to do again."""
+    workers: int = 1
+    """Processes on this machine; more than one needs the extra "cluster"."""
+    cluster: str | None = None
+    """The address of a dask scheduler, such as tcp://10.0.0.5:8786, whose workers do the rendering."""
 
     def run(self) -> int:
-        """Render and write all of them, or nothing."""
-        from rf3dgs.cli.chain import photograph
+        """Render what the folder lacks, then write the cameras."""
+        from rf3dgs.cli.chain import photos_of, shots_of_tour
         from rf3dgs.cli.facts import open_scene
-        from rf3dgs.core.files import atomic_folder
         from rf3dgs.data.formats.nerfstudio import write_nerfstudio
+        from rf3dgs.propagation.jobs import run_job
+        from rf3dgs.propagation.photo_job import PhotoJob
+        from rf3dgs.propagation.presets import preset_of
 
-        if self.count < 1:
-            raise InputError(f"--count must be at least 1; got {self.count}")
-        _refuse_other_folder(self.out)
+        _at_least_one(("--count", self.count), ("--shard-size", self.shard_size), ("--workers", self.workers))
+        crew = _crew(self.workers, self.cluster)
         scene = open_scene(self.scene)
-        with atomic_folder(self.out) as folder:
-            photos = photograph(scene, self.count, self.tour_seed, self.photo, folder, console())
-            write_nerfstudio(folder, photos)
+        if self.preset is not None:
+            scene, _ = preset_of(self.preset).applied(scene)
+        shots = shots_of_tour(scene, self.count, self.tour_seed, self.photo)
+        rule = {"how": "a walk", "seed": self.tour_seed}
+        job = PhotoJob(scene if self.preset else self.scene, shots, rule, self.shard_size)
+        run_job(job, self.out, crew=crew, progress=console())
+        write_nerfstudio(self.out, photos_of(shots, self.out))
         out(f"{self.out}: {self.count} photographs of {self.photo.width}x{self.photo.height}")
         return 0
 
 
-def _refuse_other_folder(folder: Path) -> None:
-    """Refuse to replace a folder that holds anything but an earlier tour."""
-    from rf3dgs.data.formats.nerfstudio import FILE_NAME
+def _at_least_one(*options: tuple[str, int]) -> None:
+    for name, value in options:
+        if value < 1:
+            raise InputError(f"{name} must be at least 1; got {value}")
 
-    items = folder.iterdir() if folder.is_dir() else ()
-    others = sorted(item.name for item in items if not re.fullmatch(rf"\d{{5}}\.jpg|{re.escape(FILE_NAME)}", item.name))
-    if others:
-        raise InputError(
-            f"{folder} would be replaced, but it holds something else than a tour, such as {others[0]}; choose another "
-            "name with --out"
-        )
+
+def _crew(workers: int, cluster: str | None) -> "AbstractContextManager[Crew] | None":
+    """Who does the work: this process (None), processes on this machine, or a dask cluster."""
+    if cluster is None and workers == 1:
+        return None
+    from rf3dgs.propagation.cluster import existing_cluster, local_processes
+
+    if cluster is None:
+        return local_processes(workers)
+    if workers != 1:
+        raise InputError("--workers starts processes here, --cluster uses those of a scheduler; give one of them")
+    return existing_cluster(cluster)

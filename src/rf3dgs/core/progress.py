@@ -65,7 +65,7 @@ class Console:
         left = (self._total - self._done) / rate if rate > 0 else float("inf")
         filled = round(20 * self._done / self._total)
         bar = "#" * filled + "-" * (20 - filled) if self.stream.isatty() else ""
-        eta = f"{left:.0f} s left" if left < 36_000 else "estimating"
+        eta = "estimating" if left == float("inf") else f"{duration(left)} left"
         return " ".join(f"{self._label} {bar} {self._done}/{self._total} {rate:.1f}/s {eta} {note}".split())[:79]
 
     def _write(self, text: str, *, last: bool) -> None:
@@ -74,6 +74,15 @@ class Console:
         else:
             self.stream.write(text + "\n")
         self.stream.flush()
+
+
+def duration(seconds: float) -> str:
+    """A time in words: "42 s", "3 min 20 s", "14 h 5 min"."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    minutes, rest = divmod(whole, 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
 
 
 def track(items: Iterable[Item], label: str, total: int, progress: Progress) -> Iterator[Item]:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from rf3dgs.data.split import protocol as protocol
     from rf3dgs.data.split import split_positions as split_positions
     from rf3dgs.data.validate import Fault as Fault
+    from rf3dgs.data.video import photos_of_video as photos_of_video
 
 _MODULES = {
     "Dataset": ".dataset",
@@ -45,6 +46,7 @@ _MODULES = {
     "write_nerfstudio": ".formats.nerfstudio",
     "read_blender": ".formats.blender",
     "read_rf3dgs_v0": ".formats.rf3dgs_v0",
+    "photos_of_video": ".video",
     "poses_from_photos": ".sfm",
     "Similarity": ".align",
     "Fault": ".validate",
@@ -66,6 +68,7 @@ __all__ = [  # noqa: RUF022
     "write_nerfstudio",
     "read_blender",
     "read_rf3dgs_v0",
+    "photos_of_video",
     "poses_from_photos",
     "Similarity",
     "Fault",

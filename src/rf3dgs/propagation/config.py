@@ -1,6 +1,7 @@
 """What can be chosen about tracing and photographing; free of heavy imports, so that `--help` is instant."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -23,10 +24,38 @@ class TraceConfig:
     """Whether mirror-like reflections are traced."""
     diffuse: bool = True
     """Whether diffuse reflections are traced."""
+    refraction: bool = False
+    """Whether rays pass through walls; what passes an outer wall is lost."""
+    diffraction: bool = False
+    """Whether rays bend round the edges of solid objects, once per path."""
     cell_deg: float = 1.0
     """`trace` merges diffuse paths that arrive within one cell of this size [deg] ..."""
     delay_step: float = 1e-9
     """... and within this delay [s]; line of sight and purely specular paths are kept exactly."""
+
+
+@dataclass(frozen=True)
+class ReceiverConfig:
+    """Where receivers stand."""
+
+    kind: Literal["random", "grid", "route"] = "random"
+    """Drawn uniformly in the free space, on a regular grid in it, or along a walked route."""
+    count: int | None = None
+    """How many are drawn, 72 unless given; random only."""
+    seed: int = 0
+    """Decides where they are drawn; random only."""
+    spacing: float = 0.5
+    """Distance [m] between neighbours of a grid."""
+    route: tuple[tuple[float, float], ...] = ()
+    """Waypoints (x, y) [m] of a route."""
+    speed: float = 1.0
+    """Speed of the walk along a route [m/s] ..."""
+    interval: float = 0.25
+    """... and time between two of its receivers [s]."""
+    height: float | None = None
+    """Height above the ground [m]; the scene's own heights, or their middle on grids and routes, when absent."""
+    clearance: float = 0.35
+    """Least distance from every surface [m]."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +68,8 @@ class PhotoConfig:
     """Rows."""
     fov_deg: float = 85.0
     """Horizontal field of view [deg]."""
+    walk: Literal["level", "coverage"] = "level"
+    """Once round looking across, or also out at the walls, down at the floor and up at the ceiling."""
     samples: int = 64
     """Light paths per pixel, rounded up to a square number; noise falls with the square root."""
     held_out_samples: int | None = None

@@ -1,45 +1,36 @@
 """The built-in site: a furnished lobby of 14 m x 15 m x 3.5 m at 60 GHz, described once for radio and for light."""
 
-from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.propagation import textures as paint
+from rf3dgs.propagation.lobby_extras import people_of
+from rf3dgs.propagation.lobby_parts import DOORS, ENTRANCE, HEIGHT, LENGTH, LIFTS, WIDTH, WINDOWS, lobby_object
 from rf3dgs.propagation.scene import Scene, SceneObject
-from rf3dgs.propagation.shapes import Mesh, ball, box, join, prism, quad, wall
+from rf3dgs.propagation.shapes import ball, box, join, prism, quad, wall
 
-WIDTH, LENGTH, HEIGHT = 14.0, 15.0, 3.5  # x, y, z [m]
-
-SCATTERING = {
-    "concrete": 0.90,
-    "plasterboard": 0.90,
-    "ceiling_board": 0.92,
-    "floorboard": 0.85,
-    "wood": 0.80,
-    "chipboard": 0.85,
-    "glass": 0.45,
-    "metal": 0.60,
-}
-"""Scattering amplitude S of each material: S^2 of the reflected power is diffuse, the rest mirror-like."""
-
-THICKNESS = {
-    "concrete": 0.20,
-    "plasterboard": 0.10,
-    "ceiling_board": 0.02,
-    "floorboard": 0.03,
-    "wood": 0.03,
-    "chipboard": 0.02,
-    "glass": 0.012,
-    "metal": 0.01,
-}
-"""Thickness of each material [m], which its reflection depends on."""
+Detail = Literal["plain", "full"]
 
 
-def lobby() -> Scene:
-    """The lobby: origin in the floor's south-west corner, x east, y north, z up; transmitter high in that corner."""
+def lobby(detail: Detail = "plain", people: int = 0) -> Scene:
+    """The lobby: origin in the floor's south-west corner, x east, y north, z up; transmitter high in that corner.
+
+    detail: "plain" is what the shipped dataset was made from; "full" adds frames, fittings, lamps' rims, more furniture
+    and plants of leaves. people: how many persons stand and walk there, up to eight.
+    """
+    if detail not in ("plain", "full"):
+        raise InputError(f'detail must be "plain" or "full"; got {detail!r}')
     objects = [*_shell(), *_openings(), *_lights(), *_columns(), *_furniture(), *_plants(), *_signs()]
+    if detail == "full":
+        from rf3dgs.propagation.lobby_detail import fixtures
+        from rf3dgs.propagation.lobby_furniture import furnishings
+
+        kept = (item for item in objects if not item.name.startswith("plant-"))
+        objects = [*kept, *fixtures(), *furnishings()]
+    objects += people_of(people)
     return Scene(
         name="lobby",
         objects=tuple(objects),
@@ -50,39 +41,6 @@ def lobby() -> Scene:
         frequency=60e9,
         exposure=1.7,
     )
-
-
-def _object(
-    name: str,
-    mesh: Mesh,
-    material: str,
-    picture: NDArray[np.floating],
-    size: Sequence[float],
-    *,
-    solid: bool = False,
-    glow: float = 0.0,
-    scattering: float | None = None,
-) -> SceneObject:
-    """An object whose texture is `picture`, `size` (width, height) [m], repeated where the surface is larger."""
-    vertices, faces, uv = mesh
-    return SceneObject(
-        name=name,
-        vertices=vertices,
-        faces=faces,
-        material=material,
-        scattering=SCATTERING[material] if scattering is None else scattering,
-        thickness=THICKNESS[material],
-        texture=paint.finish(picture),
-        uv=uv / uv.new_tensor([float(size[0]), float(size[1])]),
-        glow=glow,
-        solid=solid,
-    )
-
-
-WINDOWS = ((2.5, 5.0, 0.8, 2.8), (6.25, 8.75, 0.8, 2.8), (10.0, 12.5, 0.8, 2.8))
-ENTRANCE = (5.6, 8.4, 0.0, 2.6)
-DOORS = ((3.0, 4.0, 0.0, 2.1), (10.0, 11.0, 0.0, 2.1))
-LIFTS = ((1.6, 2.8, 0.0, 2.2), (3.4, 4.6, 0.0, 2.2))
 
 
 def _shell() -> list[SceneObject]:
@@ -119,28 +77,32 @@ def _shell() -> list[SceneObject]:
     for index, left in enumerate((5.4, 8.6, 11.4)):
         paint.poster(north, WIDTH, left, 0.7, (1.9, 1.5), 40 + index)
     return [
-        _object("floor", quad((0, LENGTH, 0), (WIDTH, 0, 0), (0, -LENGTH, 0)), "floorboard", floor, (WIDTH, LENGTH)),
-        _object(
+        lobby_object(
+            "floor", quad((0, LENGTH, 0), (WIDTH, 0, 0), (0, -LENGTH, 0)), "floorboard", floor, (WIDTH, LENGTH)
+        ),
+        lobby_object(
             "ceiling", quad((0, 0, HEIGHT), (WIDTH, 0, 0), (0, LENGTH, 0)), "ceiling_board", ceiling, (WIDTH, LENGTH)
         ),
-        _object(
+        lobby_object(
             "wall-south",
             wall((WIDTH, 0, HEIGHT), (-WIDTH, 0, 0), HEIGHT, [ENTRANCE]),
             "plasterboard",
             south,
             (WIDTH, HEIGHT),
         ),
-        _object(
+        lobby_object(
             "wall-west", wall((0, 0, HEIGHT), (0, LENGTH, 0), HEIGHT, WINDOWS), "plasterboard", west, (LENGTH, HEIGHT)
         ),
-        _object(
+        lobby_object(
             "wall-east",
             wall((WIDTH, LENGTH, HEIGHT), (0, -LENGTH, 0), HEIGHT, DOORS),
             "concrete",
             east,
             (LENGTH, HEIGHT),
         ),
-        _object("wall-north", wall((0, LENGTH, HEIGHT), (WIDTH, 0, 0), HEIGHT, LIFTS), "wood", north, (WIDTH, HEIGHT)),
+        lobby_object(
+            "wall-north", wall((0, LENGTH, HEIGHT), (WIDTH, 0, 0), HEIGHT, LIFTS), "wood", north, (WIDTH, HEIGHT)
+        ),
     ]
 
 
@@ -150,21 +112,23 @@ def _openings() -> list[SceneObject]:
     for number, (left, right, foot, head) in enumerate(WINDOWS, 1):
         size = (right - left, head - foot)
         mesh = quad((0, left, head), (0, size[0], 0), (0, 0, -size[1]))
-        objects.append(_object(f"window-{number}", mesh, "glass", paint.outdoors(*size, 50 + number), size, glow=0.9))
+        objects.append(
+            lobby_object(f"window-{number}", mesh, "glass", paint.outdoors(*size, 50 + number), size, glow=0.9)
+        )
     left, right, foot, head = ENTRANCE
     size = (right - left, head - foot)
     mesh = quad((WIDTH - left, 0, head), (-size[0], 0, 0), (0, 0, -size[1]))
-    objects.append(_object("entrance", mesh, "glass", paint.outdoors(*size, 60), size, glow=0.7))
+    objects.append(lobby_object("entrance", mesh, "glass", paint.outdoors(*size, 60), size, glow=0.7))
     for number, (left, right, foot, head) in enumerate(DOORS, 1):
         size = (right - left, head - foot)
         mesh = quad((WIDTH, LENGTH - left, head), (0, -size[0], 0), (0, 0, -size[1]))
         objects.append(
-            _object(f"door-{number}", mesh, "wood", paint.door(*size, (0.55, 0.36, 0.20), 62 + number), size)
+            lobby_object(f"door-{number}", mesh, "wood", paint.door(*size, (0.55, 0.36, 0.20), 62 + number), size)
         )
     for number, (left, right, foot, head) in enumerate(LIFTS, 1):
         size = (right - left, head - foot)
         mesh = quad((left, LENGTH, head), (size[0], 0, 0), (0, 0, -size[1]))
-        objects.append(_object(f"lift-{number}", mesh, "metal", paint.lift(*size, 66 + number), size))
+        objects.append(lobby_object(f"lift-{number}", mesh, "metal", paint.lift(*size, 66 + number), size))
     return objects
 
 
@@ -175,7 +139,7 @@ def _lights() -> list[SceneObject]:
     for number in range(8):
         x, y = (3.5, 10.5)[number % 2], 1.9 + 3.75 * (number // 2)
         mesh = quad((x - 0.9, y - 0.3, HEIGHT - 0.02), (1.8, 0, 0), (0, 0.6, 0))
-        objects.append(_object(f"light-{number + 1}", mesh, "plasterboard", shade, (1.8, 0.6), glow=20.0))
+        objects.append(lobby_object(f"light-{number + 1}", mesh, "plasterboard", shade, (1.8, 0.6), glow=20.0))
     return objects
 
 
@@ -188,10 +152,10 @@ def _columns() -> list[SceneObject]:
     objects = []
     for number, (x, y) in enumerate(((4.5, 4.6), (9.5, 10.4)), 1):
         mesh = box((x - 0.3, y - 0.3, 0), (x + 0.3, y + 0.3, HEIGHT))
-        objects.append(_object(f"column-{number}", mesh, "concrete", stone, (2.4, HEIGHT), solid=True))
+        objects.append(lobby_object(f"column-{number}", mesh, "concrete", stone, (2.4, HEIGHT), solid=True))
     for number, (x, y) in enumerate(((9.5, 4.6), (4.5, 10.4)), 3):
         mesh = prism((x, y), 0.38, 0.0, HEIGHT, 16)
-        objects.append(_object(f"column-{number}", mesh, "plasterboard", bands, (2.4, HEIGHT), solid=True))
+        objects.append(lobby_object(f"column-{number}", mesh, "plasterboard", bands, (2.4, HEIGHT), solid=True))
     return objects
 
 
@@ -204,25 +168,29 @@ def _furniture() -> list[SceneObject]:
     screen = paint.tiles(3.0, 1.9, ((0.30, 0.50, 0.32), (0.52, 0.68, 0.46)), (0.5, 0.475), 94, joint=(0.16, 0.26, 0.18))
     books = paint.tiles(2.0, 2.0, ((0.30, 0.20, 0.40), (0.80, 0.66, 0.30)), (0.10, 0.4), 95, joint=(0.25, 0.18, 0.12))
     objects = [
-        _object("desk-front", box((8.6, 12.3, 0), (12.4, 12.9, 1.1)), "wood", front, (2.0, 1.1), solid=True),
-        _object("desk-side", box((11.8, 12.9, 0), (12.4, 14.2, 1.1)), "wood", front, (2.0, 1.1), solid=True),
-        _object("desk-top", box((8.5, 12.2, 1.1), (12.5, 13.0, 1.16)), "chipboard", top, (2.0, 1.0), solid=True),
+        lobby_object("desk-front", box((8.6, 12.3, 0), (12.4, 12.9, 1.1)), "wood", front, (2.0, 1.1), solid=True),
+        lobby_object("desk-side", box((11.8, 12.9, 0), (12.4, 14.2, 1.1)), "wood", front, (2.0, 1.1), solid=True),
+        lobby_object("desk-top", box((8.5, 12.2, 1.1), (12.5, 13.0, 1.16)), "chipboard", top, (2.0, 1.0), solid=True),
     ]
     for number, (x, y) in enumerate(((1.2, 5.6), (1.2, 9.4), (6.3, 7.1), (12.9, 7.5)), 1):
         parts = [box((x - 0.3, y - 1.0, 0.12), (x + 0.3, y + 1.0, 0.46))]
         back = x - 0.3 if number < 3 else x + 0.2
         parts.append(box((back, y - 1.0, 0.46), (back + 0.1, y + 1.0, 0.95)))
-        objects.append(_object(f"bench-{number}", join(parts), "wood", seat, (1.0, 1.0), solid=True))
+        objects.append(lobby_object(f"bench-{number}", join(parts), "wood", seat, (1.0, 1.0), solid=True))
     for number, (low, size) in enumerate(
         (((12.3, 1.0, 0.0), 0.9), ((12.5, 2.2, 0.0), 0.7), ((12.4, 1.1, 0.9), 0.6)), 1
     ):
         high = tuple(value + size for value in low)
-        objects.append(_object(f"crate-{number}", box(low, high), "chipboard", crate, (1.0, 1.0), solid=True))
+        objects.append(lobby_object(f"crate-{number}", box(low, high), "chipboard", crate, (1.0, 1.0), solid=True))
     objects += [
-        _object("partition", box((6.2, 11.0, 0), (8.2, 11.12, 1.9)), "plasterboard", screen, (3.0, 1.9), solid=True),
-        _object("cabinet", box((5.0, 14.5, 0), (5.0 + 2.0, 14.95, 2.0)), "chipboard", books, (2.0, 2.0), solid=True),
-        _object("table", box((7.4, 6.4, 0.38), (8.6, 7.8, 0.45)), "chipboard", top, (2.0, 1.0), solid=True),
-        _object("table-foot", prism((8.0, 7.1), 0.12, 0.0, 0.38, 8), "metal", top, (2.0, 1.0), solid=True),
+        lobby_object(
+            "partition", box((6.2, 11.0, 0), (8.2, 11.12, 1.9)), "plasterboard", screen, (3.0, 1.9), solid=True
+        ),
+        lobby_object(
+            "cabinet", box((5.0, 14.5, 0), (5.0 + 2.0, 14.95, 2.0)), "chipboard", books, (2.0, 2.0), solid=True
+        ),
+        lobby_object("table", box((7.4, 6.4, 0.38), (8.6, 7.8, 0.45)), "chipboard", top, (2.0, 1.0), solid=True),
+        lobby_object("table-foot", prism((8.0, 7.1), 0.12, 0.0, 0.38, 8), "metal", top, (2.0, 1.0), solid=True),
     ]
     return objects
 
@@ -236,7 +204,7 @@ def _plants() -> list[SceneObject]:
     objects = []
     for number, (x, y) in enumerate(((13.3, 14.3), (0.8, 14.2), (4.4, 0.7), (9.9, 0.8)), 1):
         objects.append(
-            _object(
+            lobby_object(
                 f"pot-{number}",
                 prism((x, y), 0.24, 0.0, 0.5, 8, top_radius=0.32),
                 "concrete",
@@ -246,7 +214,7 @@ def _plants() -> list[SceneObject]:
             )
         )
         foliage = ball((x, y, 1.05), (0.42, 0.42, 0.56))
-        objects.append(_object(f"plant-{number}", foliage, "wood", leaf, (0.8, 0.8), solid=True, scattering=0.97))
+        objects.append(lobby_object(f"plant-{number}", foliage, "wood", leaf, (0.8, 0.8), solid=True, scattering=0.97))
     return objects
 
 
@@ -255,6 +223,6 @@ def _signs() -> list[SceneObject]:
     board = paint.lettering(3.0, 0.5, (0.10, 0.16, 0.32), (0.95, 0.92, 0.80), 110, lines=2)
     totem = paint.lettering(0.8, 1.8, (0.85, 0.80, 0.70), (0.55, 0.12, 0.10), 111, lines=7)
     return [
-        _object("board", box((9.0, 12.55, 2.5), (12.0, 12.6, 3.0)), "metal", board, (3.0, 0.5), solid=True),
-        _object("totem", box((8.6, 2.4, 0.0), (9.4, 2.55, 1.8)), "chipboard", totem, (0.8, 1.8), solid=True),
+        lobby_object("board", box((9.0, 12.55, 2.5), (12.0, 12.6, 3.0)), "metal", board, (3.0, 0.5), solid=True),
+        lobby_object("totem", box((8.6, 2.4, 0.0), (9.4, 2.55, 1.8)), "chipboard", totem, (0.8, 1.8), solid=True),
     ]

@@ -1,6 +1,7 @@
 """Triangles: distances to them, what they enclose, their colours, and the files they are kept in."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -60,6 +61,28 @@ def _winding(points: Tensor, corners: Tensor) -> Tensor:
     return torch.atan2(triple, below).sum(-1) / (2 * math.pi)
 
 
+def is_shell(item: "SceneObject", low: Tensor, high: Tensor) -> bool:
+    """True for the object that reaches over the whole site: a room's walls or the ground."""
+    size = (high - low)[:2]
+    return bool((item.vertices.amax(0) - item.vertices.amin(0))[:2].ge(0.98 * size).all())
+
+
+def is_closed(item: "SceneObject") -> bool:
+    """True when every edge belongs to two triangles, corners at the same place counting as one."""
+    _, corner = torch.unique((item.vertices * 1e4).round(), dim=0, return_inverse=True)
+    faces = corner[item.faces]
+    edges = torch.cat((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]])).sort(-1).values
+    _, count = torch.unique(edges, dim=0, return_counts=True)
+    return bool((count == 2).all())
+
+
+def facing_outwards(item: "SceneObject") -> "SceneObject":
+    """A closed object with its faces turned round when they enclose a negative volume."""
+    a, b, c = item.vertices[item.faces].double().unbind(1)
+    inside_out = float((a * torch.linalg.cross(b, c)).sum()) < 0
+    return replace(item, faces=item.faces.flip(1)) if inside_out else item
+
+
 def coloured(item: "SceneObject", longest_edge: float | None) -> tuple[Tensor, Tensor, Tensor]:
     """Vertices `[V, 3]`, faces `[F, 3]` and their sRGB colours `[F, 3]`, cut until no edge exceeds `longest_edge`."""
     uv = torch.zeros(len(item.vertices), 2) if item.uv is None else item.uv
@@ -87,6 +110,15 @@ def coloured(item: "SceneObject", longest_edge: float | None) -> tuple[Tensor, T
     row = (centre[:, 1] * height).long().clamp(0, height - 1)
     col = (centre[:, 0] * width).long().clamp(0, width - 1)
     return vertices, faces, torch.from_numpy(item.texture.copy())[row, col].float() / 255.0
+
+
+def welded(item: "SceneObject") -> "SceneObject":
+    """The object with one vertex for all corners within 0.1 mm, without its texture and triangles that vanish."""
+    _, corner, count = torch.unique((item.vertices * 1e4).round(), dim=0, return_inverse=True, return_counts=True)
+    first = corner.argsort(stable=True)[count.cumsum(0) - count]
+    faces = corner[item.faces]
+    distinct = (faces != faces.roll(1, 1)).all(1)
+    return replace(item, vertices=item.vertices[first], faces=faces[distinct], texture=None, uv=None)
 
 
 def write_mesh(path: Path, vertices: Tensor, faces: Tensor, uv: Tensor | None) -> None:

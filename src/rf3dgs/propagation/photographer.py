@@ -2,72 +2,24 @@
 
 import math
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
+from rf3dgs.core.cube import face_cameras, sample_faces
 from rf3dgs.core.errors import InputError, MissingDependencyError
 from rf3dgs.core.frames import Pose, mitsuba_from_viewmat
-from rf3dgs.core.grids import Camera, pinhole_grid
+from rf3dgs.core.grids import Camera, equirect_grid
 from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.propagation.config import PhotoConfig
 from rf3dgs.propagation.llvm import find_llvm, mitsuba_variant, prepare
 from rf3dgs.propagation.scene import Scene
 from rf3dgs.propagation.scene_files import srgb_from_linear, write_visual_scene
-
-REACH = 0.8
-"""How far the walk goes towards the edge of `camera_bounds`, as a share of half its size."""
-SWAY = 0.3
-"""How far camera heights swing about the middle of `camera_bounds`, as a share of half its height."""
-PITCH_DEG, NOD_DEG = -3.0, 7.0
-"""Mean pitch of the cameras, upwards positive, and how far it swings about it."""
-SWAYS, NODS = 7, 5
-"""Swings of height and of pitch in one round."""
-CLEARANCE = 0.45
-"""Distance of the cameras from every surface [m]."""
-
-
-def camera_tour(scene: Scene, count: int, seed: int, config: PhotoConfig | None = None) -> list[Camera]:
-    """`count` cameras of one walk round the middle of `camera_bounds`, in equal steps, all looking across it.
-
-    The walk is a rounded rectangle; height and pitch swing slowly, so that neighbours see nearly the same from places
-    a step apart, and every wall is seen from the far side. Where something stands in the way the camera steps towards
-    the middle, or, when all of that is blocked, to the nearest of many free places drawn with `seed`.
-    """
-    config = PhotoConfig() if config is None else config
-    grid = pinhole_grid(config.width, config.height, config.fov_deg)
-    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in scene.camera_bounds)
-    middle, half = (low + high) / 2, (high - low) / 2
-    around = _rounded_rectangle(count) * REACH * half[:2]
-    part = torch.arange(count, dtype=torch.float64) * (2 * math.pi / count)
-    height = SWAY * half[2] * torch.sin(SWAYS * part)
-    pitch = torch.deg2rad(PITCH_DEG + NOD_DEG * torch.sin(NODS * part))
-    nearer = torch.linspace(1.0, 0.3, 36, dtype=torch.float64)[:, None, None]
-    level = torch.cat((nearer * around, height[:, None].expand(len(nearer), -1, 1)), -1)
-    places = (middle + level).float()
-    free = scene.free(places, CLEARANCE)
-    place = places[free.int().argmax(0), torch.arange(count)]
-    blocked = ~free.any(0)
-    if bool(blocked.any()):
-        pool = scene.free_points(scene.camera_bounds, 4000, seed, clearance=CLEARANCE)
-        place = torch.where(blocked[:, None], pool[torch.cdist(place, pool).argmin(-1)], place)
-    ahead = -torch.nn.functional.normalize(around, dim=-1)
-    forward = torch.cat((ahead, torch.tan(pitch)[:, None]), -1).float()
-    return [Camera.of(Pose.look_at(at, at + way), grid) for at, way in zip(place, forward, strict=True)]
-
-
-def _rounded_rectangle(count: int) -> Tensor:
-    """Points `[count, 2]` in equal steps along x^4 + y^4 = 1, from the x axis counter-clockwise."""
-    angle = torch.linspace(0.0, 2 * math.pi, 4001, dtype=torch.float64)
-    curve = torch.stack((torch.cos(angle), torch.sin(angle)), -1)
-    curve = curve / curve.pow(4).sum(-1, keepdim=True) ** 0.25
-    length = torch.cat((curve.new_zeros(1), torch.linalg.vector_norm(curve[1:] - curve[:-1], dim=-1).cumsum(0)))
-    at = torch.arange(count, dtype=torch.float64) * (length[-1] / count)
-    return curve[torch.searchsorted(length, at)]
+from rf3dgs.propagation.walks import camera_tour as camera_tour
 
 
 def render_photos(
@@ -78,9 +30,55 @@ def render_photos(
     Works without LLVM too, three times slower. Raises MissingDependencyError without Mitsuba.
     """
     config = PhotoConfig() if config is None else config
+    progress = Silent() if progress is None else progress
+    with _studio(scene, config) as light:
+        progress.start("photographs", len(cameras))
+        for number, camera in enumerate(cameras):
+            yield _developed(light(camera, config.seed + number), scene, config)
+            progress.update(number + 1)
+        progress.finish()
+
+
+def render_panoramas(
+    scene: Scene, poses: Pose, width: int, config: PhotoConfig | None = None, progress: Progress | None = None
+) -> Iterator[NDArray[np.uint8]]:
+    """Yield one equirectangular photograph `[width / 2, width, 3]`, sRGB bytes, per pose `[n]`.
+
+    Pixels are those of `equirect_grid(width, width // 2)`, so a photograph lies over a spectrum of the same pose. Six
+    pinhole pictures on the faces of a cube are put together; what `config` says of size and field of view is ignored.
+    """
+    config = PhotoConfig() if config is None else config
+    progress = Silent() if progress is None else progress
+    if width < 8 or width % 2 or len(poses.batch_shape) != 1:
+        raise InputError(
+            f"panoramas need an even width of at least 8 pixels and a list of poses [n]; got {width} and "
+            f"{list(poses.batch_shape)}"
+        )
+    grid, size = equirect_grid(width, width // 2), math.ceil(width / 3)  # a face is as fine as the sphere's equator
+    with _studio(scene, config) as light:
+        progress.start("panoramas", len(poses))
+        for number in range(len(poses)):
+            seeds = range(config.seed + 6 * number, config.seed + 6 * number + 6)
+            faces = [light(camera, seed) for camera, seed in zip(face_cameras(poses[number], size), seeds, strict=True)]
+            picture = sample_faces(torch.from_numpy(np.stack(faces)).float(), size, grid.directions)
+            yield _developed(picture.double().numpy(), scene, config)
+            progress.update(number + 1)
+        progress.finish()
+
+
+def render_panorama(scene: Scene, pose: Pose, width: int, config: PhotoConfig | None = None) -> NDArray[np.uint8]:
+    """The equirectangular photograph `[width / 2, width, 3]`, sRGB bytes, at one pose; see `render_panoramas`."""
+    if pose.batch_shape:
+        raise InputError(f"a panorama stands at one pose; got {list(pose.batch_shape)}. Choose one, as in pose[0]")
+    (picture,) = render_panoramas(scene, Pose(pose.position[None], pose.orientation[None]), width, config)
+    return picture
+
+
+@contextmanager
+def _studio(scene: Scene, config: PhotoConfig) -> Iterator[Callable[[Camera, int], NDArray[np.float64]]]:
+    """The scene loaded into Mitsuba, as a function of camera and seed that gives linear light `[row, col, 3]`."""
     if config.samples < 1 or config.bounces < 1:
         raise InputError(f"samples and bounces must be at least 1; got {config.samples} and {config.bounces}")
-    progress = Silent() if progress is None else progress
     if find_llvm().path is not None:
         prepare()
     try:
@@ -90,12 +88,11 @@ def render_photos(
     variant = "llvm_ad_rgb" if find_llvm().path is not None else "scalar_rgb"
     with tempfile.TemporaryDirectory(prefix="rf3dgs-") as folder, mitsuba_variant(variant):
         loaded = mitsuba.load_file(str(write_visual_scene(scene, Path(folder))), optimize=False)
-        progress.start("photographs", len(cameras))
-        for number, camera in enumerate(cameras):
-            picture = _render(mitsuba, loaded, camera, config, config.seed + number)
-            yield np.round(255.0 * srgb_from_linear(config.exposure * scene.exposure * picture)).astype(np.uint8)
-            progress.update(number + 1)
-        progress.finish()
+        yield lambda camera, seed: _render(mitsuba, loaded, camera, config, seed)
+
+
+def _developed(light: NDArray[np.float64], scene: Scene, config: PhotoConfig) -> NDArray[np.uint8]:
+    return np.round(255.0 * srgb_from_linear(config.exposure * scene.exposure * light)).astype(np.uint8)
 
 
 def _render(mitsuba, loaded, camera: Camera, config: PhotoConfig, seed: int) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -16,6 +16,7 @@ from rf3dgs.propagation import meshes
 from rf3dgs.propagation.materials import permittivity
 
 Bounds = tuple[Sequence[float], Sequence[float]]
+MAX_ALPHA_R = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +26,10 @@ class SceneObject:
     vertices `[V, 3]` [m], faces `[F, 3]` with normals towards free space; uv `[V, 2]` texture coordinates, v downwards
         from the picture's top row, repeated outside [0, 1].
     material: a name of `materials.ITU`; scattering: amplitude S in [0, 1], so that S^2 of the reflected power is
-        diffuse; thickness [m].
+        diffuse; thickness [m]. alpha_r: the diffuse power leaves in a lobe round the mirror direction, the narrower the
+        larger this whole number (directive model of Degli-Esposti et al., 2007); None scatters by Lambert's law.
+    electric: (relative permittivity, conductivity [S/m]) at every frequency in place of the material's.
+    transparency: share of the light that passes straight through; photographs only.
     texture `[row, col, 3]` sRGB bytes, or None for the plain sRGB `colour`. glow: emitted light relative to white.
     solid: closed, and nobody can stand inside.
     """
@@ -41,6 +45,9 @@ class SceneObject:
     uv: Tensor | None = None
     glow: float = 0.0
     solid: bool = False
+    alpha_r: int | None = None
+    electric: tuple[float, float] | None = None
+    transparency: float = 0.0
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", self.name):
@@ -56,8 +63,26 @@ class SceneObject:
             raise InputError(f"{self.name}: faces name vertices that do not exist ({len(self.vertices)} vertices)")
         if not 0.0 <= self.scattering <= 1.0:
             raise InputError(f"{self.name}: scattering is an amplitude S between 0 and 1; got {self.scattering}")
+        if self.alpha_r is not None and not (isinstance(self.alpha_r, int) and 1 <= self.alpha_r <= MAX_ALPHA_R):
+            raise InputError(f"{self.name}: alpha_r must be a whole number from 1 to {MAX_ALPHA_R}; got {self.alpha_r}")
+        if self.electric is not None and not (self.electric[0] >= 1.0 and 0.0 <= self.electric[1] < math.inf):
+            raise InputError(
+                f"{self.name}: electric must be a relative permittivity of at least 1 and a conductivity [S/m] of at "
+                f"least 0; got {self.electric}"
+            )
+        if not (0.0 <= self.transparency < 1.0 and 0.0 < self.thickness < math.inf):
+            raise InputError(
+                f"{self.name}: transparency must be from 0 to below 1 and thickness [m] positive; "
+                f"got {self.transparency} and {self.thickness}"
+            )
         if self.texture is not None and (self.uv is None or self.uv.shape != (len(self.vertices), 2)):
             raise InputError(f"{self.name}: a texture needs uv coordinates [V, 2], one per vertex")
+
+    def permittivity(self, frequency: float) -> tuple[float, float]:
+        """Relative permittivity and conductivity [S/m] at `frequency` [Hz]; InputError when they are not defined."""
+        if self.electric is not None:
+            return self.electric
+        return permittivity(self.material, frequency, owner=f"object {self.name!r}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +150,18 @@ class Scene:
         if not bool(((point > low) & (point < high)).all()):
             return "outside"
         for item in self.objects:
-            if item.solid and bool(meshes.inside(point[None], item.vertices[item.faces])):
+            if not item.solid:
+                continue
+            corners = item.vertices[item.faces]
+            if bool(meshes.near_box(point[None], corners, 0.0)) and bool(meshes.inside(point[None], corners)):
                 return item.name
         return None
+
+    def nearest(self, point: Tensor) -> tuple[str, float]:
+        """The object whose surface is nearest to `point` `[3]`, and its distance [m]."""
+        found = {item.name: float(meshes.distance(point[None], item.vertices[item.faces])) for item in self.objects}
+        name = min(found, key=lambda name: found[name])
+        return name, found[name]
 
     def receivers(self, count: int, seed: int, *, clearance: float = 0.35) -> Pose:
         """`count` level poses drawn uniformly in the free part of `rx_bounds`, `clearance` [m] from every surface."""
@@ -151,9 +185,14 @@ class Scene:
     def check_radio(self, frequency: float) -> None:
         """Raise InputError when an object's material is unknown or not defined at `frequency` [Hz]."""
         for item in self.objects:
-            permittivity(item.material, frequency, owner=f"object {item.name!r}")
+            item.permittivity(frequency)
 
     @property
     def size(self) -> float:
         """The diagonal of the bounds [m]."""
         return math.dist(*self.bounds)
+
+
+def without_looks(scene: Scene) -> Scene:
+    """The scene as radio sees it: objects without textures, which are most of its bytes."""
+    return replace(scene, objects=tuple(replace(item, texture=None, uv=None) for item in scene.objects))

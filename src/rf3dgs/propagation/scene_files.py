@@ -3,25 +3,30 @@
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Literal
 
 import numpy as np
 
 from rf3dgs.core.errors import DataError
 from rf3dgs.core.files import atomic_file, write_whole
 from rf3dgs.propagation import meshes
-from rf3dgs.propagation.materials import permittivity
-from rf3dgs.propagation.scene import Scene, SceneObject
+from rf3dgs.propagation.scene import MAX_ALPHA_R, Scene, SceneObject
 
 VERSION = "2.1.0"
 LARGEST_XML = 16 * 2**20  # bytes
 LEAST_SAMPLING = 0.2  # light paths that seek a faint light, as a share of those that seek the brightest
 
 
-def write_radio_scene(scene: Scene, folder: str | Path, *, frequency: float | None = None) -> Path:
+def write_radio_scene(
+    scene: Scene, folder: str | Path, *, frequency: float | None = None, corners: Literal["split", "shared"] = "split"
+) -> Path:
     """Write `radio.xml` (Sionna RT) and `meshes/*.ply`; returns the XML's path.
 
     Materials are written with their permittivity and conductivity at `frequency` [Hz] (the scene's when absent),
-    because Sionna loads scenes at 3.5 GHz, where some of them are not defined by name.
+    because Sionna loads scenes at 3.5 GHz, where some of them are not defined by name. Its XML has no element for the
+    width of a scattering lobe: it is in the material's name, `-a` and alpha_R, and `scene_of` reads it from there.
+    corners: "shared" lets neighbouring triangles share their corners, without which Sionna finds no edges that
+    diffract; such meshes have no texture coordinates.
     """
     folder = Path(folder)
     frequency = scene.frequency if frequency is None else frequency
@@ -31,13 +36,13 @@ def write_radio_scene(scene: Scene, folder: str | Path, *, frequency: float | No
         if _radio_name(item) not in known:
             known[_radio_name(item)] = None
             bsdf = ET.SubElement(root, "bsdf", type="radio-material", id=_radio_name(item))
-            eta, sigma = permittivity(item.material, frequency, owner=f"object {item.name!r}")
+            eta, sigma = item.permittivity(frequency)
             _value(bsdf, "float", "relative_permittivity", eta)
             _value(bsdf, "float", "conductivity", sigma)
             _value(bsdf, "float", "thickness", item.thickness)
             _value(bsdf, "float", "scattering_coefficient", item.scattering)
     for item in scene.objects:
-        shape = _shape(root, item, folder)
+        shape = _shape(root, meshes.welded(item) if corners == "shared" else item, folder)
         ET.SubElement(shape, "ref", id=_radio_name(item), name="bsdf")
     return _write_xml(root, folder / "radio.xml")
 
@@ -63,7 +68,11 @@ def write_visual_scene(scene: Scene, folder: str | Path) -> Path:
     brightest = max((item.glow for item in scene.objects), default=0.0)
     for item in scene.objects:
         shape = _shape(root, item, folder)
-        outer = ET.SubElement(shape, "bsdf", type="twosided")
+        whole = shape
+        if item.transparency > 0:
+            whole = ET.SubElement(shape, "bsdf", type="mask")
+            _value(whole, "float", "opacity", round(1 - item.transparency, 4))
+        outer = ET.SubElement(whole, "bsdf", type="twosided")
         bsdf = ET.SubElement(outer, "bsdf", type="diffuse")
         if item.glow > 0:
             _value(bsdf, "rgb", "reflectance", "0.05")
@@ -108,8 +117,16 @@ def check_foreign_xml(path: str | Path) -> None:
             raise DataError(f"{path} names the file {name!r}, which does not exist beside it")
 
 
+def lobe_of_name(material: str) -> int | None:
+    """The alpha_R that `write_radio_scene` put into a material's name, or None."""
+    found = re.fullmatch(r"radio-.*-a(\d{1,3})", material)
+    return int(found[1]) if found and 1 <= int(found[1]) <= MAX_ALPHA_R else None
+
+
 def _radio_name(item: SceneObject) -> str:
-    return f"radio-{item.material}-s{item.scattering:g}-d{item.thickness:g}"
+    electric = "" if item.electric is None else f"-e{item.electric[0]:g}-c{item.electric[1]:g}"
+    lobe = "" if item.alpha_r is None else f"-a{item.alpha_r}"
+    return f"radio-{item.material}{electric}-s{item.scattering:g}-d{item.thickness:g}{lobe}"
 
 
 def _shape(root: ET.Element, item: SceneObject, folder: Path) -> ET.Element:

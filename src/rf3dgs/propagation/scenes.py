@@ -9,9 +9,10 @@ import torch
 
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose
+from rf3dgs.propagation import meshes
 from rf3dgs.propagation.lobby import lobby
 from rf3dgs.propagation.scene import Bounds, Scene, SceneObject
-from rf3dgs.propagation.scene_files import check_foreign_xml
+from rf3dgs.propagation.scene_files import check_foreign_xml, lobe_of_name
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,10 @@ FOREIGN_SCATTERING = 0.6
 
 
 def scene_of(name_or_xml: str | Path | Scene, *, scattering: float | None = None) -> Scene:
-    """The scene "lobby", one that ships with Sionna RT ("box", "simple_street_canyon", "munich", ...), or an XML file.
+    """The scene of that name, or the one that a folder of meshes or a Sionna/Mitsuba XML file describes.
 
+    Names: "lobby", "lobby-full" (at full detail), and those that ship with Sionna RT ("box", "simple_street_canyon",
+    "munich", ...). A folder holds PLY, OBJ or GLB meshes and a `materials.toml` (`mesh_folder.read_mesh_folder`).
     scattering: the amplitude S given to every material that has none; 0.6 for Sionna's scenes, and 0 (as written) for
     XML files when absent. Raises InputError for an unknown name, DataError for an unsafe or broken file,
     MissingDependencyError without sionna-rt.
@@ -55,8 +58,12 @@ def scene_of(name_or_xml: str | Path | Scene, *, scattering: float | None = None
     if isinstance(name_or_xml, Scene):
         return name_or_xml
     name = str(name_or_xml)
-    if name == "lobby":
-        return lobby()
+    if name in ("lobby", "lobby-full"):
+        return lobby("plain" if name == "lobby" else "full")
+    if Path(name).is_dir():
+        from rf3dgs.propagation.mesh_folder import read_mesh_folder
+
+        return read_mesh_folder(Path(name))
     if Path(name).suffix.lower() == ".xml":
         check_foreign_xml(name)
         return _read(Path(name).stem, Path(name), scattering or 0.0, None)
@@ -65,7 +72,10 @@ def scene_of(name_or_xml: str | Path | Scene, *, scattering: float | None = None
     folder = Path(import_sionna().__file__).parent / "scenes"
     known = sorted(path.parent.name for path in folder.glob("*/*.xml"))
     if name not in known:
-        raise InputError(f"no scene is named {name!r}; use lobby, an .xml file, or one of Sionna's: {', '.join(known)}")
+        raise InputError(
+            f"no scene is named {name!r}; use lobby, lobby-full, a folder of meshes, an .xml file, or one of Sionna's: "
+            f"{', '.join(known)}"
+        )
     amplitude = FOREIGN_SCATTERING if scattering is None else scattering
     return _read(name, folder / name / f"{name}.xml", amplitude, SITES.get(name))
 
@@ -86,9 +96,9 @@ def _read(name: str, path: Path, scattering: float, site: Site | None) -> Scene:
         raise DataError(f"{path} has no objects; a scene needs at least one shape with a radio material")
     corners = torch.cat([item.vertices for item in objects])
     low, high = corners.amin(0), corners.amax(0)
-    shells = [item.name for item in objects if _is_shell(item, low, high)]
-    objects = [replace(item, solid=item.name not in shells and _is_closed(item)) for item in objects]
-    open_sky = not any(item.name in shells and _is_closed(item) for item in objects)
+    shells = [item.name for item in objects if meshes.is_shell(item, low, high)]
+    objects = [replace(item, solid=item.name not in shells and meshes.is_closed(item)) for item in objects]
+    open_sky = not any(item.name in shells and meshes.is_closed(item) for item in objects)
     site = _middle(low, high) if site is None else site
     headroom = 50.0 if open_sky else 0.0
     bounds = (low - 0.01).tolist(), (high + torch.tensor([0.01, 0.01, 0.01 + headroom])).tolist()
@@ -119,22 +129,8 @@ def _object(name: str, item, scattering: float) -> SceneObject:
         scattering=own if own > 0 else scattering,
         thickness=float(np.array(material.thickness).reshape(-1)[0]),
         colour=colour if len(colour) == 3 else (0.6, 0.6, 0.6),
+        alpha_r=lobe_of_name(material.name),
     )
-
-
-def _is_shell(item: SceneObject, low: torch.Tensor, high: torch.Tensor) -> bool:
-    """True for the object that reaches over the whole site: a room's walls or the ground."""
-    size = (high - low)[:2]
-    return bool((item.vertices.amax(0) - item.vertices.amin(0))[:2].ge(0.98 * size).all())
-
-
-def _is_closed(item: SceneObject) -> bool:
-    """True when every edge belongs to two triangles, corners at the same place counting as one."""
-    _, corner = torch.unique((item.vertices * 1e4).round(), dim=0, return_inverse=True)
-    faces = corner[item.faces]
-    edges = torch.cat((faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]])).sort(-1).values
-    _, count = torch.unique(edges, dim=0, return_counts=True)
-    return bool((count == 2).all())
 
 
 def _middle(low: torch.Tensor, high: torch.Tensor) -> Site:

@@ -80,6 +80,25 @@ def prism(
     return join(meshes)
 
 
+def rod(start: Vector, end: Vector, radius: float, sides: int, *, end_radius: float | None = None) -> Mesh:
+    """A closed round bar of `sides` faces from `start` to `end`, a cone's stump when `end_radius` differs."""
+    a, b = (torch.tensor(value, dtype=torch.float64) for value in (start, end))
+    length = float((b - a).norm())
+    axis = (b - a) / length
+    aside = torch.eye(3, dtype=torch.float64)[int(axis.abs().argmin())]
+    x = torch.nn.functional.normalize(torch.linalg.cross(aside, axis), dim=-1)
+    turn = torch.stack((x, torch.linalg.cross(axis, x), axis), -1)
+    vertices, faces, uv = prism((0.0, 0.0), radius, 0.0, length, sides, top_radius=end_radius)
+    return (a + vertices.double() @ turn.mT).float(), faces, uv
+
+
+def turned(mesh: Mesh, place: Vector, heading: float) -> Mesh:
+    """The mesh turned about its z axis by `heading` [rad] and moved to `place`."""
+    c, s = math.cos(heading), math.sin(heading)
+    turn = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return mesh[0] @ turn.mT + torch.tensor(place, dtype=torch.float32), mesh[1], mesh[2]
+
+
 def ball(centre: Vector, radii: Vector, *, around: int = 10, rows: int = 6) -> Mesh:
     """A closed ellipsoid of `around` x `rows` facets."""
     vertices, uv, faces = [], [], []

@@ -1,6 +1,6 @@
 """Paths traced by NVIDIA's Sionna RT on the CPU: line of sight, mirrors and diffuse reflections.
 
-One receiver is traced at a time, which keeps memory flat. Rays do not pass through walls and do not bend round edges.
+One receiver is traced at a time, which keeps memory flat. Rays pass through walls and bend round edges on request only.
 A path's gain is the mean over two transmit polarisations (vertical, horizontal) of the power summed over both receive
 polarisations; its phase is that of vertical to vertical.
 """
@@ -58,11 +58,13 @@ def trace_each(
     *,
     frequency: float | None = None,
     indices: Sequence[int] | None = None,
+    tracer: "Tracer | None" = None,
 ) -> Iterator[Paths]:
     """Yield all paths `[1, path]` to one receiver after the other, sorted by delay, then by angles.
 
     Receiver i uses the seed `config.seed + i`, or `config.seed + indices[i]` when `rx` is part of a longer list, so
     that a run may be cut in pieces. The same arguments give the same bits. What nothing reaches has zero paths.
+    tracer: one that has loaded this scene at this frequency, which saves half a second per call.
     Raises InputError for a receiver outside the scene, inside an object or at the transmitter, and for materials that
     are not defined at the frequency; MissingDependencyError without sionna-rt or LLVM.
     """
@@ -73,15 +75,22 @@ def trace_each(
     scene = scene if isinstance(scene, Scene) else scene_of(scene)
     tx = scene.tx if tx is None else tx
     frequency = frequency or config.frequency or scene.frequency
-    _check(scene, tx, rx, config, frequency)
-    numbers = range(len(rx)) if indices is None else indices
-    return _trace_each(scene, tx, rx, config, progress, frequency, list(numbers))
+    numbers = list(range(len(rx)) if indices is None else indices)
+    _check(scene, tx, rx, config, frequency, numbers)
+    return _trace_each(scene, tx, rx, config, progress, frequency, numbers, tracer)
 
 
 def _trace_each(
-    scene: Scene, tx: Pose, rx: Pose, config: TraceConfig, progress: Progress, frequency: float, numbers: list[int]
+    scene: Scene,
+    tx: Pose,
+    rx: Pose,
+    config: TraceConfig,
+    progress: Progress,
+    frequency: float,
+    numbers: list[int],
+    tracer: "Tracer | None",
 ) -> Iterator[Paths]:
-    tracer = Tracer(scene, frequency)
+    tracer = Tracer(scene, frequency, diffraction=config.diffraction) if tracer is None else tracer
     progress.start("tracing", len(rx))
     for done, number in enumerate(numbers):
         yield tracer.paths(tx, rx[done : done + 1], config, config.seed + number)
@@ -107,30 +116,49 @@ def import_sionna():
 class Tracer:
     """A scene loaded into Sionna RT, ready for one receiver after the other."""
 
-    def __init__(self, scene: Scene, frequency: float) -> None:
+    def __init__(self, scene: Scene, frequency: float, *, diffraction: bool = False) -> None:
+        """Load `scene` at `frequency` [Hz]; with `diffraction` the meshes' edges are made known to Sionna."""
         self._rt = rt = import_sionna()
-        self._frequency = frequency
+        self._frequency, self._has_edges = frequency, diffraction
+        corners = "shared" if diffraction else "split"
         with mitsuba_variant(VARIANT), ExitStack() as stack:
             if scene.source is not None:
                 self._scene = rt.load_scene(str(scene.source), merge_shapes=False)
                 for item in scene.objects:
                     self._scene.objects[item.name].radio_material.scattering_coefficient = item.scattering
+                self._tune(scene, frequency)
             else:
                 folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="rf3dgs-"))
-                path = write_radio_scene(scene, folder, frequency=frequency)
+                path = write_radio_scene(scene, folder, frequency=frequency, corners=corners)
                 self._scene = rt.load_scene(str(path), merge_shapes=False)
-            self._scene.frequency = frequency
+                self._scene.frequency = frequency
+            for item in scene.objects:
+                if item.alpha_r is not None:
+                    lobe = rt.DirectivePattern(alpha_r=item.alpha_r)
+                    self._scene.objects[item.name].radio_material.scattering_pattern = lobe
             array = rt.PlanarArray(
                 num_rows=1, num_cols=1, vertical_spacing=0.5, horizontal_spacing=0.5, pattern="iso", polarization="VH"
             )
             self._scene.tx_array = self._scene.rx_array = array
             self._solver = rt.PathSolver(deterministic=True)
 
+    def _tune(self, scene: Scene, frequency: float) -> None:
+        """Set the frequency of a scene from a file, whose materials only Sionna knows."""
+        try:
+            self._scene.frequency = frequency
+        except ValueError as error:
+            raise InputError(
+                f"scene {scene.name!r} has a material that is not defined at {frequency / 1e9:g} GHz ({error}); choose "
+                "another frequency, or give the material its own permittivity in the XML"
+            ) from error
+
     def paths(self, tx: Pose, rx: Pose, config: TraceConfig, seed: int) -> Paths:
         """All paths `[1, path]` to the one receiver `rx` `[1]`, sorted by delay, then by angles.
 
         Line of sight and mirrors are those of the first pass; the diffuse paths of all passes share their power.
         """
+        if config.diffraction and not self._has_edges:
+            raise InputError("this tracer was made without diffraction; make it with Tracer(..., diffraction=True)")
         scene, rt = self._scene, self._rt
         with mitsuba_variant(VARIANT):
             for name in [*scene.transmitters, *scene.receivers]:
@@ -155,8 +183,8 @@ class Tracer:
             los=config.line_of_sight and number == 0,
             specular_reflection=config.specular,
             diffuse_reflection=config.diffuse,
-            refraction=False,
-            diffraction=False,
+            refraction=config.refraction,
+            diffraction=config.diffraction,
             seed=seed + 1_000_003 * number,
         )
         valid = np.array(found.valid)[0, 0]
@@ -200,7 +228,7 @@ def _paths(columns: list[NDArray], frequency: float, tx: Pose, rx: Pose) -> Path
     )
 
 
-def _check(scene: Scene, tx: Pose, rx: Pose, config: TraceConfig, frequency: float) -> None:
+def _check(scene: Scene, tx: Pose, rx: Pose, config: TraceConfig, frequency: float, numbers: Sequence[int]) -> None:
     """Refuse what cannot be traced, naming the receiver and what is in its way."""
     if tx.batch_shape or len(rx.batch_shape) != 1:
         raise InputError(f"tx must be one pose and rx a list [rx]; got {tx.batch_shape} and {rx.batch_shape}")
@@ -215,7 +243,7 @@ def _check(scene: Scene, tx: Pose, rx: Pose, config: TraceConfig, frequency: flo
         scene.check_radio(frequency)
     for label, position in [
         ("the transmitter", tx.position),
-        *((f"receiver {i}", p) for i, p in enumerate(rx.position)),
+        *((f"receiver {i}", p) for i, p in zip(numbers, rx.position, strict=True)),
     ]:
         place = "(" + ", ".join(f"{value:g}" for value in position.tolist()) + ")"
         occupant = scene.occupant(position)

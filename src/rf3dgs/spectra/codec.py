@@ -62,6 +62,34 @@ def window_of(spectra: Spectrum, *, headroom_db: float = 1.0, floor_percentile: 
 
 
 @dataclass(frozen=True)
+class PerViewLinear:
+    """Power relative to the strongest direction of the same view, linear, between 0 and 1.
+
+    What the paper (and NeRF2) give CBF and TCBF, whose side lobes fill a dB scale. A view's level is lost, and one
+    place looks different from every position: `decode` needs each view's peak back.
+    """
+
+    name = "linear per view"
+
+    def encode(self, power: Tensor) -> Tensor:
+        """P / max(P) of each view, `[*batch, row, col]`; zero where a view has no power."""
+        peak = power.amax((-2, -1), keepdim=True)
+        return torch.where(peak > 0, power / peak, torch.zeros_like(power))
+
+    def decode(self, value: Tensor, peak: Tensor | float = 1.0) -> Tensor:
+        """Linear power of encoded values `[*batch, row, col]`; `peak` `[*batch]` powers of the views' strongest."""
+        return value * torch.as_tensor(peak)[..., None, None]
+
+
+def paper_scale(spectra: Spectrum) -> PerViewLinear | DbWindow:
+    """The paper's scale for a set of spectra: per view and linear for "bartlett" and "tapered", one dB window else.
+
+    Paper, section II-D.
+    """
+    return PerViewLinear() if spectra.method in ("bartlett", "tapered") else window_of(spectra)
+
+
+@dataclass(frozen=True)
 class PaperEncoding:
     """The paper's own picture of CSI, for comparison: four channels between 0 and 1.
 

@@ -18,6 +18,7 @@ from rf3dgs.core.angles import angles_of
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid, sample_grid
+from rf3dgs.core.native import native_core, thread_count
 from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 
@@ -116,17 +117,14 @@ class LobeSum:
     def __call__(self, paths: Paths, world_from_device: Tensor) -> Tensor:
         """Sums `[row, col, 5]` (float64) of power, power x delay [s] and power x departure vector of one receiver."""
         gain = paths.path_gain
-        arriving = gain > 0
-        chosen = paths._map(lambda value: value[arriving])
-        gain = gain[arriving].double()
-        values = torch.cat((gain[:, None], gain[:, None] * chosen.delay[:, None], gain[:, None] * chosen.aod), -1)
-        directions = chosen.aoa @ world_from_device
-        exact = _exact(chosen, gain)
-        total = self._sum_exactly(directions[exact], values[exact])
-        if not bool(exact.all()):
+        directions, departures = paths.aoa @ world_from_device, paths.aod
+        exact = _exact(paths, gain)
+        total = self._sum_exactly(directions[exact], _values(gain[exact], paths.delay[exact], departures[exact]))
+        gain = torch.where(exact, torch.zeros_like(gain), gain)
+        if bool((gain > 0).any()):
             if self.sphere is None:
                 self.sphere = _Sphere(self.grid, self.lobe, self.sharpness, self.cut)
-            total += self.sphere(directions[~exact], values[~exact])
+            total += self.sphere(directions, gain, paths.delay, departures)
         return total
 
     def _sum_exactly(self, directions: Tensor, values: Tensor) -> Tensor:
@@ -149,18 +147,25 @@ class LobeSum:
 
 
 def _exact(paths: Paths, gain: Tensor) -> Tensor:
-    """Which paths are summed exactly `[path]`."""
-    exact = torch.zeros(len(gain), dtype=torch.bool)
-    if len(gain) <= EXACT_ALWAYS:
-        return ~exact
+    """Which of the paths that arrive are summed exactly `[path]`."""
+    arriving = gain > 0
+    if int(arriving.sum()) <= EXACT_ALWAYS:
+        return arriving
+    exact = torch.zeros_like(arriving)
     if paths.kind is not None:
-        exact = (paths.kind & DIFFUSE) == 0
+        exact = arriving & ((paths.kind & DIFFUSE) == 0)
     elif paths.order is not None:
-        exact = paths.order == 0
+        exact = arriving & (paths.order == 0)
     if int(exact.sum()) > EXACT_ALWAYS:
         exact = torch.zeros_like(exact)
     exact[gain.topk(EXACT_STRONGEST).indices] = True
     return exact
+
+
+def _values(gain: Tensor, delay: Tensor, departures: Tensor) -> Tensor:
+    """Gain, gain x delay and gain x departure vector `[path, 5]`, float64."""
+    gain = gain.double()[:, None]
+    return torch.cat((gain, gain * delay[:, None], gain * departures), -1)
 
 
 class _Sphere:
@@ -189,8 +194,8 @@ class _Sphere:
         zenith = (np.arange(self.rows) + 0.5) * (math.pi / self.rows)
         half = np.arange(self.columns // 2 + 1) * (2 * math.pi / self.columns)
         seen = np.zeros(self.rows)
-        self.kernels: list[tuple[int, int, np.ndarray]] = []
-        for row in range(height):
+        self.kernels: list[tuple[int, int, Tensor]] = []
+        for row in range((height + 1) // 2):
             centre = (row + 0.5) * math.pi / height
             first = int(np.searchsorted(zenith, centre - cut))
             last = int(np.searchsorted(zenith, centre + cut, side="right"))
@@ -200,36 +205,57 @@ class _Sphere:
             kernel[kernel < CUT] = 0.0
             circle = np.concatenate((kernel, kernel[:, (self.columns - 1) // 2 : 0 : -1]), 1)
             spectrum = np.fft.rfft(circle).real
-            seen[first:last] += solid_angle[row] * spectrum[:, 0] / self.columns
-            self.kernels.append((first, last, spectrum))
-        self.scale = (math.pi / sharpness) / seen
-
-    def __call__(self, directions: Tensor, values: Tensor) -> Tensor:
-        """The smoothed sums `[row, col, 5]` on the grid of paths at device-frame `directions` `[path, 3]`."""
-        waves = np.fft.rfft(self._deposit(directions, values) * self.scale[:, None], axis=-1)
-        smooth = np.empty((CHANNELS, self.picture.height, self.picture.width))
+            self.kernels.append((first, last, torch.from_numpy(spectrum)))
+        below = [(self.rows - last, self.rows - first, kernel.flip(0)) for first, last, kernel in self.kernels]
+        self.kernels += below[: height // 2][::-1]
         for row, (first, last, kernel) in enumerate(self.kernels):
-            line = np.einsum("if,cif->cf", kernel, waves[:, first:last])
-            smooth[:, row] = np.fft.irfft(line, self.columns)[:, :: self.fold]
-        smooth[:, smooth[0] < FLOOR * smooth[0].max()] = 0.0
-        picture = torch.from_numpy(np.ascontiguousarray(np.moveaxis(smooth, 0, -1)))
+            seen[first:last] += solid_angle[row] * kernel[:, 0].numpy() / self.columns
+        self.scale = torch.from_numpy((math.pi / sharpness) / seen)
+
+    def __call__(self, directions: Tensor, gain: Tensor, delay: Tensor, departures: Tensor) -> Tensor:
+        """The smoothed sums `[row, col, 5]` on the grid of paths at device-frame `directions` `[path, 3]`."""
+        deposit = _deposited(directions, gain, delay, departures, (self.rows, self.columns, self.fold))
+        waves = torch.fft.rfft(deposit * self.scale[:, None], dim=-1)
+        lines = torch.stack([(waves[:, first:last] * kernel).sum(1) for first, last, kernel in self.kernels], 1)
+        smooth = torch.fft.irfft(lines, self.columns)[..., :: self.fold]
+        smooth = torch.where(smooth[0] < FLOOR * smooth[0].max(), torch.zeros_like(smooth), smooth)
+        picture = smooth.movedim(0, -1).contiguous()
         if self.grid.kind == "equirect":
             return picture
         return sample_grid(picture, self.picture, self.grid.directions)
 
-    def _deposit(self, directions: Tensor, values: Tensor) -> np.ndarray:
-        """Bilinear deposit of `values` `[path, 5]` onto the nodes: `[5, rows, columns]`."""
-        zenith, azimuth = (angle.numpy() for angle in angles_of(directions))
-        y = zenith * (self.rows / math.pi) - 0.5
-        x = (math.pi - azimuth) * (self.columns / (2 * math.pi)) - 0.5 * self.fold
-        row, column = np.floor(y), np.floor(x)
-        down, right = y - row, x - column
-        channels = np.ascontiguousarray(values.numpy().T)
-        total = np.zeros((CHANNELS, self.rows * self.columns))
-        for i, row_weight in ((0, 1 - down), (1, down)):
-            at_row = np.clip(row.astype(np.int64) + i, 0, self.rows - 1) * self.columns
-            for j, weight in ((0, row_weight * (1 - right)), (1, row_weight * right)):
-                node = at_row + (column.astype(np.int64) + j) % self.columns
-                for channel in range(CHANNELS):
-                    total[channel] += np.bincount(node, channels[channel] * weight, self.rows * self.columns)
-        return total.reshape(CHANNELS, self.rows, self.columns)
+
+def _deposited(
+    directions: Tensor, gain: Tensor, delay: Tensor, departures: Tensor, sphere: tuple[int, int, int]
+) -> Tensor:
+    """Bilinear deposit of `_values` onto the nodes of a sphere of (rows, columns, fold): `[5, rows, columns]`.
+
+    In the native core where there is one; `deposit` is its specification.
+    """
+    rows, columns, fold = sphere
+    core = native_core()
+    if core is None:
+        return deposit(directions, _values(gain, delay, departures), sphere)
+    total = torch.empty(CHANNELS, rows, columns, dtype=torch.float64)
+    arrays = (value.float().contiguous().numpy() for value in (directions, gain, delay, departures))
+    core.deposit_paths(*arrays, fold, total.numpy(), thread_count())
+    return total
+
+
+def deposit(directions: Tensor, values: Tensor, sphere: tuple[int, int, int]) -> Tensor:
+    """Bilinear deposit of `values` `[path, 5]` onto the nodes of a sphere of (rows, columns, fold), in NumPy."""
+    rows, columns, fold = sphere
+    zenith, azimuth = (angle.double().numpy() for angle in angles_of(directions))
+    y = zenith * (rows / math.pi) - 0.5
+    x = (math.pi - azimuth) * (columns / (2 * math.pi)) - 0.5 * fold
+    row, column = np.floor(y), np.floor(x)
+    down, right = y - row, x - column
+    channels = np.ascontiguousarray(values.numpy().T)
+    total = np.zeros((CHANNELS, rows * columns))
+    for i, row_weight in ((0, 1 - down), (1, down)):
+        at_row = np.clip(row.astype(np.int64) + i, 0, rows - 1) * columns
+        for j, weight in ((0, row_weight * (1 - right)), (1, row_weight * right)):
+            node = at_row + (column.astype(np.int64) + j) % columns
+            for channel in range(CHANNELS):
+                total[channel] += np.bincount(node, channels[channel] * weight, rows * columns)
+    return torch.from_numpy(total.reshape(CHANNELS, rows, columns))

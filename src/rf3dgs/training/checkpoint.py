@@ -7,9 +7,6 @@ made from (its identity) and the sha256 of both. The JSON file is written last: 
 import contextlib
 import hashlib
 import json
-import os
-import socket
-import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +17,10 @@ from safetensors.torch import load as read_tensors
 from safetensors.torch import save as tensor_bytes
 from torch import Tensor
 
+from rf3dgs.core import lock
 from rf3dgs.core.errors import DataError, InputError, TrainingError
 from rf3dgs.core.files import atomic_file, remove_partials
+from rf3dgs.core.manifest import difference
 
 SCHEMA = 1
 KEPT = 2
@@ -88,10 +87,10 @@ class CheckpointFolder:
                 body, state = _read(path)
             except DataError:
                 continue
-            difference = _difference(body["identity"], self.identity)
-            if difference:
+            found = difference(body["identity"], self.identity)
+            if found:
                 raise InputError(
-                    f"the checkpoint {path} was made with another {difference}; give the run another "
+                    f"the checkpoint {path} was made with another {found}; give the run another "
                     "checkpoint folder, go back to what the checkpoint was made with, or delete the folder"
                 )
             return int(body["iteration"]), state
@@ -126,92 +125,8 @@ def _digest(body: object) -> str:
     return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
 
 
-def _difference(before: object, now: object, name: str = "") -> str:
-    """The first place where two identities differ, in words; empty when they are equal."""
-    if isinstance(before, dict) and isinstance(now, dict):
-        for key in sorted(before.keys() | now.keys()):
-            found = _difference(before.get(key), now.get(key), f"{name}.{key}" if name else str(key))
-            if found:
-                return found
-        return ""
-    return "" if before == now else f"{name} (it had {_short(before)}, this run has {_short(now)})"
-
-
-def _short(value: object) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= 24 else text[:20] + "..."
-
-
 @contextlib.contextmanager
 def locked(folder: str | Path) -> Iterator[None]:
-    """Hold `folder` for this process: a file `lock.json` with pid and host.
-
-    The lock of a process that is gone is taken over; that of a living one (or one on another host, which cannot be
-    asked) raises `TrainingError`.
-    """
-    path = Path(folder) / "lock.json"
-    mine = {"pid": os.getpid(), "host": socket.gethostname(), "began": _birth(os.getpid()), "at": time.time_ns()}
-    _take(path, mine)
-    try:
+    """Hold a checkpoint folder for this process; `TrainingError` when another one does (`core.lock`)."""
+    with lock.locked(folder, error=TrainingError, called="checkpoint folder"):
         yield
-    finally:
-        if _holder(path) == mine:
-            path.unlink(missing_ok=True)
-
-
-def _take(path: Path, mine: dict) -> None:
-    """Create the lock, after putting aside one whose owner is gone."""
-    for _ in range(8):
-        try:
-            with os.fdopen(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644), "w") as file:
-                json.dump(mine, file)
-                return
-        except FileExistsError:
-            holder = _holder(path)
-            if _alive(holder, path):
-                raise TrainingError(
-                    f"{path.parent} is in use by process {holder.get('pid')} on {holder.get('host')}; wait for it, "
-                    f"use another checkpoint folder, or delete {path} if that run is gone"
-                ) from None
-            aside = path.with_name(f"lock.{mine['pid']}.{mine['at']}.stale")
-            with contextlib.suppress(FileNotFoundError):
-                path.rename(aside)
-                if _holder(aside) != holder:
-                    aside.rename(path)
-                aside.unlink(missing_ok=True)
-    raise TrainingError(f"cannot take the lock {path}: other runs keep taking it; use another checkpoint folder")
-
-
-def _holder(path: Path) -> dict:
-    """What the lock file says; an empty mapping when it is missing or unreadable."""
-    try:
-        holder = json.loads(path.read_bytes())
-        return holder if isinstance(holder, dict) else {}
-    except (OSError, ValueError):
-        return {}
-
-
-def _alive(holder: dict, path: Path) -> bool:
-    """Whether the lock's owner may still run. An unreadable lock counts as alive while it is being written."""
-    pid = holder.get("pid")
-    if not isinstance(pid, int) or pid < 1:
-        with contextlib.suppress(OSError):
-            return time.time() - path.stat().st_mtime < 2.0
-        return False
-    if holder.get("host") != socket.gethostname():
-        return True
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        pass
-    return holder.get("began") == _birth(pid)
-
-
-def _birth(pid: int) -> str:
-    """The process's start time in kernel ticks, which tells a reused pid from the old one; empty where unknown."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
-    except (OSError, IndexError):
-        return ""

@@ -1,0 +1,65 @@
+"""A job killed at random moments and started again, until it is done; then compared, byte for byte, with a calm run.
+
+    python -m benchmarks.scale.kill_and_resume out/killed --calm out/calm --kills 20 --seconds 30 \
+        -- trace lobby --preset paper
+
+What stands after `--` is an rf3dgs command without its --out. The calm folder is made first when it is not there. Each
+run is killed with SIGKILL, its workers too or not, a random time below `--seconds` after it took the folder's lock; the
+last one is left to finish. Prints a line of JSON; the exit status is 1 when a byte differs or a run ended too early.
+"""
+
+import argparse
+import json
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+
+def digest_of(folder: Path) -> dict[str, bytes]:
+    import hashlib
+
+    return {item.name: hashlib.sha256(item.read_bytes()).digest() for item in sorted(folder.iterdir())}
+
+
+def killed(command: list[str], out: Path, seconds: float) -> bool:
+    """Start a run and kill it `seconds` after it began to work; False when it had ended before."""
+    process = subprocess.Popen(command)
+    while process.poll() is None:
+        try:
+            if f'"pid": {process.pid},' in (out / "lock.json").read_text():
+                break
+        except OSError:
+            pass
+        time.sleep(0.01)
+    time.sleep(seconds)
+    process.send_signal(signal.SIGKILL)
+    return process.wait() == -signal.SIGKILL
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--calm", type=Path, required=True)
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("command", nargs="+")
+    options = parser.parse_args()
+    base = [sys.executable, "-m", "rf3dgs", *options.command]
+    subprocess.run([*base, "--out", str(options.calm)], check=True)
+    generator, command = random.Random(options.seed), [*base, "--out", str(options.out)]
+    kills = 0
+    while kills < options.kills and killed(command, options.out, generator.uniform(0.0, options.seconds)):
+        kills += 1
+    subprocess.run(command, check=True)
+    calm, after = digest_of(options.calm), digest_of(options.out)
+    differing = sorted(name for name in calm.keys() | after.keys() if calm.get(name) != after.get(name))
+    print(json.dumps({"kills": kills, "files": len(calm), "differing": differing}))
+    return int(bool(differing) or kills < options.kills)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,3 @@
+#include "spectra/kernels_spread.hpp"
+
+RF3DGS_DEFINE_SPECTRA(avx512_spectra)

@@ -1,0 +1,191 @@
+"""Arrays and frequency comb as one aperture: the plane wave of a path, and where in a sounding it is strongest.
+
+A plane wave is a product of five waves, one along each axis of the aperture,
+
+    s = product over axes d of exp(j 2 pi q_d theta_d),
+
+with the coordinates theta = (y and z of the direction cosines at the receiver, the same at the transmitter, delay) and
+the points q (columns and rows of both arrays [wavelengths], minus the frequencies [Hz]), all centred. The elements'
+pattern scales a wave but does not bend it, so it plays no part here.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rf3dgs.channel.arrays import PlanarArray
+from rf3dgs.channel.sounding import Sounding, seen
+
+AT_ONCE = 2**23  # complex numbers of an intermediate result
+FINER = 2  # points of the coarse grids per resolution cell
+
+
+@dataclass(frozen=True, eq=False)
+class Aperture:
+    """The aperture of a sounding without its measurements.
+
+    rx, tx: points `[3, element]` of the arrays: ones, y, z. comb: `[2, frequency]`: ones, minus the centred offsets.
+    cell: resolution `[5]` in theta, one over the aperture's length; infinite along an axis of one point.
+    """
+
+    sounding: Sounding
+    rx: Tensor
+    tx: Tensor
+    comb: Tensor
+    cell: Tensor
+
+    @classmethod
+    def of(cls, sounding: Sounding) -> "Aperture":
+        offsets = sounding.offsets
+        comb = torch.stack((torch.ones_like(offsets), offsets.mean() - offsets))
+        cells = [*_cells(sounding.array_rx), *_cells(sounding.array_tx), sounding.period / len(offsets)]
+        cell = torch.tensor(cells, dtype=torch.float64)
+        return cls(sounding, _points(sounding.array_rx), _points(sounding.array_tx), comb, cell)
+
+    @property
+    def size(self) -> int:
+        """Number of entries of a sounding of one receiver."""
+        return self.rx.shape[1] * self.tx.shape[1] * self.comb.shape[1]
+
+    @property
+    def curvature(self) -> Tensor:
+        """Expected curvature `[5]` of log |<s, x>|^2 at its maximum: 2 (2 pi)^2 times the variance of the points."""
+        points = (*self.rx[1:], *self.tx[1:], self.comb[1])
+        return torch.stack([8 * math.pi**2 * axis.square().mean() for axis in points])
+
+    def waves(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The factors `[..., rx_ant]`, `[..., tx_ant]` and `[..., frequency]` of s at theta `[..., 5]`."""
+        return (
+            _wave(theta[..., 0:2] @ self.rx[1:]),
+            _wave(theta[..., 2:4] @ self.tx[1:]),
+            _wave(theta[..., 4:5] @ self.comb[1:]),
+        )
+
+    def model(self, theta: Tensor, gain: Tensor) -> Tensor:
+        """Sum of the waves theta `[path, 5]` with gains `[path]`: `[rx_ant, tx_ant, frequency]`."""
+        a, b, e = self.waves(theta)
+        pairs = (a[:, :, None] * b[:, None, :]).flatten(1) * gain[:, None]
+        return (pairs.mT @ e).reshape(self.rx.shape[1], self.tx.shape[1], self.comb.shape[1])
+
+    def correlate(self, theta: Tensor, x: Tensor) -> Tensor:
+        """<s, x> and <q_d s, x> for the five axes, `[6]`, of the wave theta `[5]` with a response x."""
+        a, b, e = self._weighted(theta)
+        late = x @ e.mT
+        left = (a @ late.reshape(len(x), -1)).reshape(3, -1, 2)
+        return _orders(b[:, None, :, None] * left[None])
+
+    def overlap(self, theta: Tensor, others: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+        """`correlate` of the wave theta `[5]` with other waves, given by their factors `[path, ...]`: `[path, 6]`."""
+        a, b, e = (weighted @ other.mT for weighted, other in zip(self._weighted(theta), others, strict=True))
+        return torch.stack(
+            (
+                a[0] * b[0] * e[0],
+                a[1] * b[0] * e[0],
+                a[2] * b[0] * e[0],
+                a[0] * b[1] * e[0],
+                a[0] * b[2] * e[0],
+                a[0] * b[0] * e[1],
+            ),
+            -1,
+        )
+
+    def information(self, theta: Tensor, gain: Tensor) -> Tensor:
+        """Re(D^H D) `[7 path, 7 path]`, D the derivative of `model` in real and imaginary gain and the five axes."""
+        a, b, e = self.waves(theta)
+        late = self.comb[1] * e
+        factors = (
+            (a, a, self.rx[1] * a, self.rx[2] * a, a, a, a),
+            (b, b, b, b, self.tx[1] * b, self.tx[2] * b, b),
+            (e, e, e, e, e, e, late),
+        )
+        turn = 2j * math.pi * gain
+        scale = torch.stack((torch.ones_like(gain), torch.full_like(gain, 1j), *(turn,) * 5), 1).reshape(-1)
+        gram = scale[:, None].conj() * scale
+        for factor in factors:
+            columns = torch.stack(factor, 1).reshape(len(scale), -1)
+            gram = gram * (columns.conj() @ columns.mT)
+        return gram.real
+
+    def _weighted(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        a, b, e = self.waves(theta)
+        return self.rx * a.conj(), self.tx * b.conj(), self.comb * e.conj()
+
+    def admissible(self, theta: Tensor) -> tuple[bool, bool]:
+        """Whether arrival and departure of theta `[5]` are directions ahead of the arrays and in view."""
+        sounding = self.sounding
+        return (
+            bool(_seen(sounding.array_rx, sounding.fov_rx, theta[0:2])),
+            bool(_seen(sounding.array_tx, sounding.fov_tx, theta[2:4])),
+        )
+
+    def strongest(self, x: Tensor) -> Tensor:
+        """The theta `[5]` on a grid of two points per cell at which |<s, x>| is largest.
+
+        Fourier transform over frequency, products with the arrays' waves over the directions in view.
+        """
+        arrivals = _grid(self.sounding.array_rx, self.sounding.fov_rx)
+        departures = _grid(self.sounding.array_tx, self.sounding.fov_tx)
+        a = _wave(arrivals @ self.rx[1:]).conj().to(torch.complex64)
+        b = _wave(departures @ self.tx[1:]).conj().to(torch.complex64)
+        bins = FINER * x.shape[-1] if x.shape[-1] > 1 else 1
+        profile = torch.fft.ifft(x.to(torch.complex64), n=bins, dim=-1)
+        seen_from = (a @ profile.reshape(len(x), -1)).reshape(len(arrivals), -1, bins)
+        best, where = -1.0, (0, 0, 0)
+        step = max(1, AT_ONCE // (len(departures) * bins))
+        for first in range(0, len(arrivals), step):
+            power = torch.view_as_real(b @ seen_from[first : first + step]).square().sum(-1)
+            index = int(power.argmax())
+            value = float(power.reshape(-1)[index])
+            if value > best:
+                arrival, rest = divmod(index, len(departures) * bins)
+                best, where = value, (first + arrival, *divmod(rest, bins))
+        delay = torch.tensor([where[2] * self.sounding.period / bins if bins > 1 else 0.0], dtype=torch.float64)
+        return torch.cat((arrivals[where[0]], departures[where[1]], delay))
+
+
+def device_direction(cosines: Tensor) -> Tensor:
+    """Device-frame unit vectors `[..., 3]`, ahead of the array, of direction cosines y and z `[..., 2]`."""
+    ahead = (1.0 - cosines.square().sum(-1, keepdim=True)).clamp_min(0.0).sqrt()
+    return torch.cat((ahead, cosines), -1)
+
+
+def _seen(array: PlanarArray | None, fov: float, cosines: Tensor) -> Tensor:
+    return (cosines.square().sum(-1) <= 1.0) & seen(array, fov, device_direction(cosines))
+
+
+def _grid(array: PlanarArray | None, fov: float) -> Tensor:
+    """Direction cosines y and z `[direction, 2]` of a grid over what the array sees."""
+    axes = []
+    for cell in _cells(array):
+        count = 0 if math.isinf(cell) else math.floor(FINER / cell + 1e-9)
+        axes.append(torch.arange(-count, count + 1, dtype=torch.float64) * (cell / FINER if count else 1.0))
+    grid = torch.cartesian_prod(*axes)
+    return grid[_seen(array, fov, grid)]
+
+
+def _cells(array: PlanarArray | None) -> tuple[float, float]:
+    """Resolution in the direction cosines y and z: one over the array's width and height [wavelengths]."""
+    if array is None:
+        return math.inf, math.inf
+    return (
+        1.0 / (array.cols * array.horizontal) if array.cols > 1 else math.inf,
+        1.0 / (array.rows * array.vertical) if array.rows > 1 else math.inf,
+    )
+
+
+def _points(array: PlanarArray | None) -> Tensor:
+    positions = torch.zeros(1, 3, dtype=torch.float64) if array is None else array.positions
+    return torch.stack((torch.ones_like(positions[:, 0]), positions[:, 1], positions[:, 2]))
+
+
+def _wave(turns: Tensor) -> Tensor:
+    """exp(j 2 pi turns), complex128."""
+    return torch.polar(torch.ones_like(turns), 2 * math.pi * torch.remainder(turns, 1.0))
+
+
+def _orders(product: Tensor) -> Tensor:
+    """The plain correlation and those weighted along one axis, `[6]`, of `[tx 3, rx 3, tx_ant, comb 2]`."""
+    total = product.sum(2)
+    return torch.stack((total[0, 0, 0], total[0, 1, 0], total[0, 2, 0], total[1, 0, 0], total[2, 0, 0], total[0, 0, 1]))
