@@ -6,8 +6,7 @@ The second solve has another seed and another number of rays, and so another lat
 `rf3dgs trace` does, and compared as spectra: ideal on the sphere of the preset "sphere", Bartlett and Capon of an 8x8
 array in pictures of 90 degrees forward and backward. Coherent: 256 frequencies over 2 GHz, as `rf3dgs spectra` takes
 them, where each binned path has one phase; uncorrelated: the expectation over phases. For the first `--binning`
-receivers spectra of binned paths are compared with those of all paths; the array's uncorrelated and forward, since
-the phases of bins are a draw of their own.
+receivers spectra of binned paths are compared with those of all paths, the array's forward.
 """
 
 import argparse
@@ -16,17 +15,14 @@ import math
 import os
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from rf3dgs.channel.arrays import PlanarArray, planar_array
 from rf3dgs.channel.binning import bin_diffuse
 from rf3dgs.channel.paths import Paths
-from rf3dgs.channel.response import manifold
 from rf3dgs.cli.chain import REPEAT_RAYS, REPEAT_SEED
 from rf3dgs.cli.facts import open_scene
 from rf3dgs.core.files import write_whole
@@ -39,6 +35,7 @@ from rf3dgs.spectra.codec import window_of
 from rf3dgs.spectra.covariance import covariance_of
 from rf3dgs.spectra.scan import array_instrument, beamform, spectrum_of
 from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
+from rf3dgs.spectra.steering import PlanarSteering
 from rf3dgs.spectra.yaws import at_yaws
 
 YAWS = (0.0, 180.0)
@@ -55,7 +52,7 @@ class Receiver:
         self.sphere: DirectionGrid = equirect_grid(360, 180)
         self.pinhole: DirectionGrid = pinhole_grid(150, 100, fov_deg=90.0)
         self.array: PlanarArray = planar_array(8, 8, pattern="patch")
-        self.steering: Tensor = manifold(self.array, self.pinhole.directions.double())
+        self.steering = PlanarSteering(self.array, self.pinhole.directions)
 
     def ideal(self, paths: Paths) -> Pictures:
         return {IDEAL: stack_spectra([spectrum_of(paths, None, self.sphere)])}
@@ -110,14 +107,12 @@ def binning(receiver: Receiver, all_paths: Sequence[Paths]) -> list[dict]:
     """What is lost by each size of bins, over the first receivers."""
     everything = []
     for paths in all_paths:
-        # Without kinds nothing is merged on the way to a covariance.
-        single = replace(paths, kind=None)
-        everything.append(receiver.ideal(paths) | receiver.arrays(single, (None,)))
+        everything.append(receiver.ideal(paths) | receiver.arrays(paths))
     truth = gathered(everything)
     rows = []
     for cell, step in SIZES:
         binned = [as_traced(paths, cell, step) for paths in all_paths]
-        found = gathered([receiver.ideal(paths) | receiver.arrays(paths, (None,)) for paths in binned])
+        found = gathered([receiver.ideal(paths) | receiver.arrays(paths) for paths in binned])
         share = sum(int(paths.count) for paths in binned) / sum(int(paths.count) for paths in all_paths)
         for name, spectra in found.items():
             score = differences(truth[name], spectra)
