@@ -3,8 +3,8 @@
     python -m benchmarks.quality.noise --scene lobby --positions 8 [--json out/noise.json] [--page PAGE]
 
 The second solve has another seed and another number of rays, and so another lattice of them. Both are binned as
-`rf3dgs trace` does, and compared as spectra: ideal on the sphere of the preset "sphere", Bartlett and Capon of an 8x8
-array in pictures of 90 degrees forward and backward. Coherent: 256 frequencies over 2 GHz, as `rf3dgs spectra` takes
+`rf3dgs trace` does, and compared as spectra: ideal on the spheres of the preset "sphere" and of no preset, Bartlett and
+Capon of an 8x8 array in pictures of 90 degrees forward and backward. Coherent: 256 frequencies over 2 GHz, as `rf3dgs spectra` takes
 them, where each binned path has one phase; uncorrelated: the expectation over phases. For the first `--binning`
 receivers spectra of binned paths are compared with those of all paths, the array's forward.
 """
@@ -15,6 +15,7 @@ import math
 import os
 import time
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from rf3dgs.core.grids import DirectionGrid, equirect_grid, pinhole_grid
 from rf3dgs.core.progress import Console
 from rf3dgs.evaluation import metrics
 from rf3dgs.propagation.config import TraceConfig
+from rf3dgs.propagation.presets import preset_of
 from rf3dgs.propagation.sionna import trace_each
 from rf3dgs.spectra.codec import window_of
 from rf3dgs.spectra.covariance import covariance_of
@@ -40,7 +42,6 @@ from rf3dgs.spectra.yaws import at_yaws
 
 YAWS = (0.0, 180.0)
 SIZES = ((0.5, 0.5), (1.0, 1.0), (1.0, 5.0), (2.0, 2.0), (4.0, 5.0))  # cell [deg] and delay step [ns]
-IDEAL = "ideal, sphere 360x180"
 Pictures = dict[str, Spectrum]
 
 
@@ -49,13 +50,14 @@ class Receiver:
 
     def __init__(self, yaws: Sequence[float] = YAWS) -> None:
         self.yaws = [math.radians(yaw) for yaw in yaws]
-        self.sphere: DirectionGrid = equirect_grid(360, 180)
+        self.spheres: list[DirectionGrid] = [equirect_grid(360, 180), equirect_grid(180, 90)]
         self.pinhole: DirectionGrid = pinhole_grid(150, 100, fov_deg=90.0)
         self.array: PlanarArray = planar_array(8, 8, pattern="patch")
         self.steering = PlanarSteering(self.array, self.pinhole.directions)
 
     def ideal(self, paths: Paths) -> Pictures:
-        return {IDEAL: stack_spectra([spectrum_of(paths, None, self.sphere)])}
+        found = [spectrum_of(paths, None, sphere) for sphere in self.spheres]
+        return {f"{one.instrument.name}, {one.grid.width}x{one.grid.height}": stack_spectra([one]) for one in found}
 
     def arrays(self, paths: Paths, snapshots: Iterable[int | None] = (None, 256)) -> Pictures:
         """Bartlett and Capon pictures `[yaw, row, col]`, uncorrelated (None) or coherent over so many frequencies."""
@@ -123,10 +125,11 @@ def binning(receiver: Receiver, all_paths: Sequence[Paths]) -> list[dict]:
 def measured(wish: argparse.Namespace) -> dict:
     """Both solves, their differences, and the loss of binning, as JSON can hold them."""
     began, load = time.process_time(), os.getloadavg()[0]
-    scene = open_scene(wish.scene)
+    scene, first = open_scene(wish.scene), TraceConfig(rays=wish.rays)
+    if wish.preset is not None:
+        scene, first = preset_of(wish.preset).applied(scene, first)
     rx = scene.receivers(wish.positions, wish.rx_seed)
-    first = TraceConfig(rays=wish.rays)
-    second = TraceConfig(rays=round(wish.rays * REPEAT_RAYS), seed=REPEAT_SEED)
+    second = replace(first, rays=round(wish.rays * REPEAT_RAYS), seed=REPEAT_SEED)
     receiver = Receiver()
     solves: tuple[list[Pictures], list[Pictures]] = ([], [])
     kept: list[Paths] = []
@@ -145,6 +148,7 @@ def measured(wish: argparse.Namespace) -> dict:
     losses = binning(Receiver(YAWS[:1]), kept) if kept else []
     return {
         "scene": scene.name,
+        "preset": wish.preset,
         "positions": wish.positions,
         "binning_positions": len(kept),
         "rays": [first.rays, second.rays],
@@ -164,8 +168,9 @@ def number(value: float | None, digits: int) -> str:
 
 def page_tables(run: dict) -> str:
     """The run as Markdown."""
+    of_preset = f" with preset {run['preset']}" if run["preset"] else ""
     lines = [
-        f"{run['scene']}, {run['positions']} positions, depth {run['depth']}; first solve {run['rays'][0]:,} rays and "
+        f"{run['scene']}{of_preset}, {run['positions']} positions, depth {run['depth']}; first solve {run['rays'][0]:,} rays and "
         f"seed {run['seeds'][0]}, second {run['rays'][1]:,} rays and seed {run['seeds'][1]}; "
         f"{run['paths_per_position'][0]:,} to {run['paths_per_position'][1]:,} paths a position before binning.",
         "",
@@ -212,6 +217,7 @@ def put_into(page: Path, tables: str) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", default="lobby")
+    parser.add_argument("--preset", help='of rf3dgs trace, such as "paper"')
     parser.add_argument("--positions", type=int, default=8)
     parser.add_argument("--binning", type=int, default=4, help="positions whose paths are kept whole for comparison")
     parser.add_argument("--rays", type=int, default=300_000, help="of the first solve")
