@@ -4,9 +4,9 @@
 
 The second solve has another seed and another number of rays, and so another lattice of them. Both are binned as
 `rf3dgs trace` does, and compared as spectra: ideal on the spheres of the preset "sphere" and of no preset, Bartlett and
-Capon of an 8x8 array in pictures of 90 degrees forward and backward. Coherent: 256 frequencies over 2 GHz, as `rf3dgs spectra` takes
-them, where each binned path has one phase; uncorrelated: the expectation over phases. For the first `--binning`
-receivers spectra of binned paths are compared with those of all paths, the array's forward.
+Capon of an 8x8 array in pictures of 90 degrees forward and backward. Coherent: 256 frequencies over 2 GHz, as
+`rf3dgs spectra` takes them, where each binned path has one phase; uncorrelated: the expectation over phases. For the
+first `--binning` receivers spectra of binned paths are compared with those of all paths, the array's forward.
 """
 
 import argparse
@@ -169,9 +169,10 @@ def number(value: float | None, digits: int) -> str:
 def page_tables(run: dict) -> str:
     """The run as Markdown."""
     of_preset = f" with preset {run['preset']}" if run["preset"] else ""
+    (rays, more), (seed, other) = run["rays"], run["seeds"]
     lines = [
-        f"{run['scene']}{of_preset}, {run['positions']} positions, depth {run['depth']}; first solve {run['rays'][0]:,} rays and "
-        f"seed {run['seeds'][0]}, second {run['rays'][1]:,} rays and seed {run['seeds'][1]}; "
+        f"{run['scene']}{of_preset}, {run['positions']} positions, depth {run['depth']}; first solve "
+        f"{rays:,} rays and seed {seed}, second {more:,} rays and seed {other}; "
         f"{run['paths_per_position'][0]:,} to {run['paths_per_position'][1]:,} paths a position before binning.",
         "",
         "| second solve against first | pictures | main peak [deg]: median, P90, within 1 | distinct peaks: pictures, "
@@ -223,9 +224,10 @@ def main() -> None:
     parser.add_argument("--rays", type=int, default=300_000, help="of the first solve")
     parser.add_argument("--rx-seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--read", type=Path, help="take the figures of this file instead of measuring")
     parser.add_argument("--page", type=Path, help="put the tables into this page")
     wish = parser.parse_args()
-    run = measured(wish)
+    run = measured(wish) if wish.read is None else json.loads(wish.read.read_text(encoding="utf-8"))
     tables = page_tables(run)
     print(tables)
     print(f"\n{run['cpu_seconds']:.0f} s of CPU time, load {run['load'][0]:.1f} to {run['load'][1]:.1f}")
