@@ -141,7 +141,7 @@ def test_the_papers_preset_gives_four_pictures_of_each_position_on_one_side(writ
     assert main(["validate", str(out)]) == 0
 
 
-def test_the_sphere_preset_and_a_region(write_paths, tmp_path):
+def test_the_sphere_preset_and_a_region(write_paths, tmp_path, capsys):
     command = ["spectra", str(write_paths(10)), "--out", str(tmp_path / "site"), "--preset", "sphere"]
     assert main([*command, "--split", "region"]) == 0
     dataset = Dataset.load(tmp_path / "site")
@@ -149,6 +149,9 @@ def test_the_sphere_preset_and_a_region(write_paths, tmp_path):
     assert dataset.grid.shape == (180, 360)
     assert dataset.roles.count("region") == 2
     assert "test" not in dataset.roles
+    fit = ["fit", str(tmp_path / "site"), "--mesh", "lobby", "--out", str(tmp_path / "site.field")]
+    assert main([*fit, "--fraction", "1.5"]) == 2
+    assert "fraction must lie in (0, 1]" in capsys.readouterr().err
 
 
 def test_a_preset_and_what_it_sets_are_not_both_given(write_paths, tmp_path, capsys):

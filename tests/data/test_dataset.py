@@ -308,3 +308,17 @@ def test_a_part_that_was_solved_once_has_no_repeat(spectra):
     assert split.validation.repeat is None
     assert split.validation.repeat_index is None
     assert split.train.repeat_index.tolist() == [4]
+
+
+def test_a_fraction_follows_the_seed_of_the_split_and_is_kept_in_the_folder(dataset, tmp_path):
+    whole = dataset.protocol(seed=5)
+    half = whole.with_fraction(0.5)
+    assert half.roles == whole.with_fraction(0.5, seed=5).roles
+    assert half.roles != whole.with_fraction(0.5, seed=6).roles
+    assert half.roles.count("train") == half.roles.count("unused") == 8
+    loaded = half.save(tmp_path / "half")
+    assert loaded.roles == half.roles
+    assert loaded.with_fraction(1.0).roles == whole.roles
+    assert len(loaded.train.spectra) == 8
+    with pytest.raises(InputError, match="has not been split"):
+        dataset.with_fraction(0.5)

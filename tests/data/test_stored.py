@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from rf3dgs.core.errors import DataError, InputError
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import equirect_grid
 from rf3dgs.data.dataset import Dataset
 from rf3dgs.data.formats.spectra_codes import Precision
 from rf3dgs.data.formats.spectra_h5 import common_scales, join_parts, read_spectra, write_part, write_spectra
 from rf3dgs.data.formats.stored import SpectraFile, StoredSpectra
 from rf3dgs.data.validate import validate
-from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
+from rf3dgs.spectra.spectrum import Instrument, Spectrum, stack_spectra
 
 
 @pytest.fixture
@@ -151,3 +153,18 @@ def test_a_stored_spectrum_without_delays_says_so(spectra, tmp_path):
     assert stored.delay is None
     assert stored[0].aod is None
     assert stored[0].delay is None
+
+
+def test_pictures_of_little_but_nothing_are_read_back(tmp_path):
+    count, rows, cols = 450, 100, 200
+    power = torch.zeros(count, rows, cols)
+    power[:, 50, 100] = 1e-9
+    pose = Pose.scatter(((0, 0, 0), (9, 9, 2)), count, seed=0)
+    aod = torch.zeros(1, rows, cols, 3).expand(count, -1, -1, -1)
+    few = Spectrum(power, equirect_grid(cols, rows), pose, 6e10, Instrument.gaussian(0.1), "ideal", 1e2 * power, aod)
+    write_spectra(tmp_path / "s.h5", few)
+    declared = 8 * count * rows * cols
+    assert declared > 200 * (tmp_path / "s.h5").stat().st_size, "more than is believed of other files"
+    assert declared > 64 * 2**20
+    stored, _, _ = read_spectra(tmp_path / "s.h5")
+    assert float(stored[449].gain_db.max()) == pytest.approx(-90.0, abs=0.0026)

@@ -47,6 +47,8 @@ class MakeSpectra:
     """Horizontal field of view of a pinhole [deg]."""
     yaws_deg: tuple[float, ...] = (0.0,)
     """Turns of the receiver about its vertical axis [deg], a picture for each, all of one set of paths."""
+    snapshots: int | None = 256
+    """Frequencies over 2 GHz that an array's covariance is taken from; None for uncorrelated paths."""
     snr_db: float | None = None
     """Signal-to-noise ratio at the elements [dB]; no noise unless given. Array methods only."""
     split: Literal["mixed", "random", "region"] | None = None
@@ -71,7 +73,8 @@ class MakeSpectra:
 
         def spectra_at(number: int, paths: Paths) -> Spectrum:
             seed = wish.seed + number * len(yaws)
-            return spectrum_of(at_yaws(paths, yaws), array, grid, method=wish.method, snr_db=wish.snr_db, seed=seed)
+            how = {"method": wish.method, "snapshots": wish.snapshots, "snr_db": wish.snr_db, "seed": seed}
+            return spectrum_of(at_yaws(paths, yaws), array, grid, **how)
 
         settings = {
             name: value for name, value in asdict(wish).items() if name not in ("paths", "out", "split", "preset")

@@ -30,13 +30,13 @@ _NUMBERS = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.ENUM)
 _FILTERS = (h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32)
 
 
-def open_audited(path: str | Path, *, max_bytes: int = 8 * 2**30) -> h5py.File:
+def open_audited(path: str | Path, *, max_bytes: int = 8 * 2**30, max_ratio: int = MAX_RATIO) -> h5py.File:
     """Open an HDF5 file for reading after an audit of everything in it; use it in a `with` statement.
 
     Refused with a `DataError` that names the file: what is not HDF5 or is truncated; the file format before HDF5 1.10;
     soft and external links; external or virtual storage; compound, variable-length, reference and other types than
     numbers (text of fixed length is allowed as an attribute); filters other than gzip, shuffle and fletcher32; more
-    than `max_bytes` declared, or more than 200 times the file's size.
+    than `max_bytes` declared, or more than `max_ratio` times the file's size.
     """
     path = Path(path)
     if not path.is_file():
@@ -47,7 +47,7 @@ def open_audited(path: str | Path, *, max_bytes: int = 8 * 2**30) -> h5py.File:
     except (OSError, RuntimeError, ValueError) as error:
         raise DataError(f"{path}: expected an HDF5 file; it is damaged, truncated or another format") from error
     try:
-        _audit(file, path, max_bytes)
+        _audit(file, path, max_bytes, max_ratio)
     except DataError:
         file.close()
         raise
@@ -109,8 +109,8 @@ def _check_format(path: Path) -> None:
         )
 
 
-def _audit(file: h5py.File, path: Path, max_bytes: int) -> None:
-    allowed = min(max_bytes, max(ALWAYS_ALLOWED, MAX_RATIO * path.stat().st_size))
+def _audit(file: h5py.File, path: Path, max_bytes: int, max_ratio: int) -> None:
+    allowed = min(max_bytes, max(ALWAYS_ALLOWED, max_ratio * path.stat().st_size))
     declared = 0
     for name, item in _objects(file, path):
         _audit_attributes(item, path, name)

@@ -55,8 +55,8 @@ def stream_spectra(
     if count == 0:
         raise InputError("there are no receivers to make spectra of")
     longest, digest = _survey(paths, progress)
-    _claim(folder, {"settings": dict(settings), "paths": digest})
     first = spectra_at(0, paths[0])
+    _claim(folder, {"settings": dict(settings), "paths": digest})
     views = len(first) if first.pose.batch_shape else 1
     scales = common_scales(Precision(), None if first.delay is None else longest)
     size = max(1, PIXELS // (views * first.grid.height * first.grid.width), -(-count // MOST_PARTS))
@@ -73,10 +73,15 @@ def stream_spectra(
             done += 1
             progress.update(done)
 
-    for path, numbers in parts:
-        if not path.exists():
-            with atomic_file(path) as temporary:
-                write_part(temporary, made(numbers), len(numbers) * views, scales, meta)
+    try:
+        for path, numbers in parts:
+            if not path.exists():
+                with atomic_file(path) as temporary:
+                    write_part(temporary, made(numbers), len(numbers) * views, scales, meta)
+    except BaseException:
+        if not parts[0][0].exists():
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
     progress.finish()
     with atomic_file(folder / JOINED) as temporary:
         join_parts([path for path, _ in parts], temporary, count * views)

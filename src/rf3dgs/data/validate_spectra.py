@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from rf3dgs.core.errors import DataError
 from rf3dgs.core.hdf5 import open_audited, read_array, read_attribute
 from rf3dgs.core.units import LONGEST_DELAY, shortest_delay
-from rf3dgs.data.formats.spectra_h5 import LARGEST, read_spectra
+from rf3dgs.data.formats.spectra_h5 import LIMITS, read_spectra
 from rf3dgs.data.survey import Survey, survey_of
 
 Found = Iterator[tuple[str, str]]
@@ -24,7 +24,7 @@ def spectra_faults(path: Path) -> Found:
     """Pairs (what, remedy) for one file of spectra; the values are looked at raw, so that one fault hides no other."""
     again = "Write the spectra again"
     try:
-        with open_audited(path, max_bytes=LARGEST) as file:
+        with open_audited(path, **LIMITS) as file:
             if not isinstance(file.get("spectra"), h5py.Group):
                 yield "the group 'spectra' is missing", again
             for name, group in _groups(file):
@@ -46,7 +46,7 @@ def check_units(path: Path) -> None:
 
     Of many spectra 256 are looked at, from the first to the last.
     """
-    with open_audited(path, max_bytes=LARGEST) as file:
+    with open_audited(path, **LIMITS) as file:
         for name, group in _groups(file):
             for what, remedy in _unit_faults(group, name, survey_of(group, SAMPLE)):
                 raise DataError(f"{path}: {what}. {remedy}")

@@ -26,7 +26,9 @@ from rf3dgs.spectra.spectrum import Spectrum
 
 SCHEMA = "rf3dgs.spectra"
 VERSION = 1
-LARGEST = 2**44  # [byte] a file may declare so much; no more than a picture of it is read at a time
+# What a file may declare, in bytes and in bytes per byte of the file: one picture is read at a time, and pictures of
+# little but nothing are compressed as far as gzip can.
+LIMITS = {"max_bytes": 2**44, "max_ratio": 1100}
 LOWEST_DB, HIGHEST_DB = -300.0, 27.0  # what gains of spectra may be that are written before all are known
 
 
@@ -78,7 +80,7 @@ def join_parts(parts: Sequence[Path], path: Path, count: int) -> None:
     with h5py.File(path, "w", libver=LIBVER) as file:
         writer: _GroupWriter | None = None
         for part in parts:
-            with open_audited(part, max_bytes=LARGEST) as source:
+            with open_audited(part, **LIMITS) as source:
                 group = _group(source, "spectra")
                 if writer is None:
                     _write_top(file, {name: read_attribute(source, name) for name in ("generator", "seed")})
@@ -103,7 +105,7 @@ def read_spectra(path: Path) -> tuple[StoredSpectra, StoredSpectra | None, Tenso
     """
     path = Path(path).absolute()
     stamp = stamp_of(path) if path.is_file() else (0, 0, 0)
-    with open_audited(path, max_bytes=LARGEST) as file:
+    with open_audited(path, **LIMITS) as file:
         schema, version = read_attribute(file, "schema"), read_attribute(file, "version")
         if schema != SCHEMA or version != VERSION:
             raise DataError(
