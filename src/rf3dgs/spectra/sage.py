@@ -27,9 +27,9 @@ from rf3dgs.spectra.crb import Bound, cramer_rao, told_by
 MOST = 20  # paths per receiver unless told otherwise
 SWEEPS = 200
 MOVED = 0.01  # of its deviation: a path that moves less in a sweep has arrived
-EARLY = 2  # sweeps after each new path
+EARLY = 8  # sweeps after each new path, fewer where they explain nothing that noise does not
 HALVINGS = 3
-DAMPING = (1e-9, 1e-3, 1e-1)  # of joint steps, the next where the one before explains less
+LEAPS = 3  # joint steps tried, each damped more than the one before
 Untold = Literal["refuse", "ahead"]
 
 
@@ -141,6 +141,7 @@ class _Fit:
         self.residual = response
         varied = int(torch.isfinite(aperture.cell).sum())
         self.penalty = 0.5 * (2 + varied) * math.log(2 * aperture.size)  # in units of the noise power
+        self.damping = 1e-3
         self.sweeps = 0
         self.converged = True
         self._waves = aperture.waves(self.theta)
@@ -160,8 +161,11 @@ class _Fit:
                 self._improve(len(self.gain) - 1)
             self._weigh()
             for _ in range(EARLY if len(self.gain) > 1 else 0):
+                left = self.residual_power
                 self._sweep()
                 self._leap()
+                if self.aperture.size * (left - self.residual_power) < self.noise:
+                    break
             if selective and self.aperture.size * (before[2] - self.residual_power) < self.penalty * self.noise:
                 self._set(*before[:2])
                 self._weigh()
@@ -193,10 +197,13 @@ class _Fit:
 
     def _worth(self) -> Tensor:
         """How much more power `[path]` would be left over, in all entries, without each path."""
-        a, b, e = self._waves
-        gram = (a.conj() @ a.mT) * (b.conj() @ b.mT) * (e.conj() @ e.mT)
-        inverse = torch.linalg.pinv(gram, hermitian=True)
+        inverse = torch.linalg.pinv(self._gram(), hermitian=True)
         return self.gain.abs().square() / inverse.diagonal().real.clamp_min(1e-300)
+
+    def _gram(self) -> Tensor:
+        """Products of the waves with each other `[path, path]`."""
+        a, b, e = self._waves
+        return (a.conj() @ a.mT) * (b.conj() @ b.mT) * (e.conj() @ e.mT)
 
     def _set(self, theta: Tensor, gain: Tensor) -> None:
         self.theta, self.gain, self._waves = theta.clone(), gain.clone(), self.aperture.waves(theta)
@@ -212,12 +219,12 @@ class _Fit:
         self._weigh()
 
     def _leap(self) -> None:
-        """One scoring step of all paths at once, kept only where it explains more.
+        """One scoring step of all paths at once, gains by least squares, kept only where it explains more.
 
         Sweeps alone creep where paths overlap, because each path has to wait for the others.
         """
         aperture, theta, gain, left = self.aperture, self.theta, self.gain, self.residual_power
-        slopes = torch.stack([aperture.correlate(one, self.residual) for one in theta])
+        slopes = aperture.correlate(theta, self.residual)
         climb = 2 * math.pi * (gain.conj()[:, None] * slopes[:, 1:]).imag
         gradient = torch.cat((torch.view_as_real(slopes[:, 0]), climb), 1).reshape(-1)
         information = aperture.information(theta, gain)
@@ -225,15 +232,17 @@ class _Fit:
         free = torch.cat((torch.ones(2).bool(), torch.isfinite(aperture.cell))).repeat(len(gain))
         scale = torch.where(free, scale, 0.0)
         scaled = information * scale[:, None] * scale + torch.diag((~free).double())
-        for damping in DAMPING:
-            solved = torch.linalg.solve(scaled + damping * torch.eye(len(scaled)), gradient * scale) * scale
-            step = solved.reshape(-1, 7)
-            move = step[:, 2:].clamp(-0.5 * aperture.cell, 0.5 * aperture.cell)
-            there = torch.stack([self._kept_in_view(*pair) for pair in zip(theta, move, strict=True)])
-            self._set(there, gain + torch.view_as_complex(step[:, :2].contiguous()))
+        for _ in range(LEAPS):
+            solved = torch.linalg.solve(scaled + self.damping * torch.eye(len(scaled)), gradient * scale) * scale
+            move = solved.reshape(-1, 7)[:, 2:].clamp(-0.5 * aperture.cell, 0.5 * aperture.cell)
+            there = torch.stack([aperture.moved(*pair) for pair in zip(theta, move, strict=True)])
+            self._set(there, gain)
+            self.gain = torch.linalg.pinv(self._gram(), hermitian=True) @ aperture.correlate(there, self.response)[:, 0]
             self._weigh()
             if self.residual_power <= left:
+                self.damping = max(0.2 * self.damping, 1e-9)
                 return
+            self.damping = min(4.0 * self.damping, 1.0)
         self._set(theta, gain)
         self._weigh()
 
@@ -247,7 +256,7 @@ class _Fit:
         gain[index] = 0.0
 
         def correlation(at: Tensor) -> Tensor:
-            return aperture.correlate(at, self.response) - gain @ aperture.overlap(at, self._waves)
+            return aperture.correlate(at[None], self.response)[0] - gain @ aperture.overlap(at, self._waves)
 
         here = correlation(theta)
         if float(here[0].abs()) > 0:
@@ -255,7 +264,7 @@ class _Fit:
             step = torch.where(torch.isfinite(aperture.cell), slope / aperture.curvature, 0.0)
             step = step.clamp(-0.5 * aperture.cell, 0.5 * aperture.cell)
             for _ in range(HALVINGS):
-                there = self._kept_in_view(theta, step)
+                there = aperture.moved(theta, step)
                 value = correlation(there)
                 if float(value[0].abs()) >= float(here[0].abs()):
                     theta, here = there, value
@@ -264,20 +273,6 @@ class _Fit:
         self.theta[index], self.gain[index] = theta, here[0] / aperture.size
         for cache, wave in zip(self._waves, aperture.waves(theta), strict=True):
             cache[index] = wave
-
-    def _kept_in_view(self, theta: Tensor, step: Tensor) -> Tensor:
-        """theta plus what of the step stays in view: both direction cosines of an end, or one of them, or none."""
-        there = theta + step
-        for end, fine in enumerate(self.aperture.admissible(there)):
-            if fine:
-                continue
-            y, z = 2 * end, 2 * end + 1
-            for kept in ((y,), (z,), (y, z)):
-                there[y], there[z] = theta[y] + step[y], theta[z] + step[z]
-                there[list(kept)] = theta[list(kept)]
-                if self.aperture.admissible(there)[end]:
-                    break
-        return there
 
 
 def _paths(found: list[_Fit], rows: Sounding) -> tuple[Paths, Tensor]:
