@@ -4,10 +4,10 @@
 
 First table: scenes of three random paths at 20 dB SNR, each at least one and a half resolution cells apart in one
 dimension; root mean square of error over bound, and how many trials found three paths. Second: the built-in lobby
-traced to random receivers that look at the transmitter, sounded over 1 GHz between 8x8 and 4x4 patches at 20 dB SNR. Wanted in
-each position are the line of sight and the three mirror paths that the sounder hears loudest, leaving out those within
-one resolution cell of a louder one; found is a path with an estimate less than one cell away in delay and in all
-direction cosines.
+traced to random receivers that look at the transmitter, sounded over 1 GHz between 8x8 and 4x4 patches at 20 dB SNR.
+Wanted in each position are the line of sight and the three mirror paths that the sounder hears loudest, leaving out
+those within one resolution cell of a louder one; found is a path with an estimate less than one cell away in delay and
+in all direction cosines.
 """
 
 import argparse
@@ -194,9 +194,10 @@ def print_lobby(positions: int) -> None:
         sounding = sound(paths, LARGE)
         estimate = estimate_paths(sounding)
         everything.append(wanted_paths(paths, sounding, estimate.paths, position, most=12))
+        left = float(estimate.residual_power / estimate.noise_power)
         print(
             f"position {position}: {len(paths.delay)} paths, {estimate.paths.coeff.shape[-1]} found, "
-            f"{int(estimate.sweeps)} sweeps, residual {float(estimate.residual_power / estimate.noise_power):.1f} x noise",
+            f"{int(estimate.sweeps)} sweeps, residual {left:.1f} x noise",
             flush=True,
         )
     print(f"CPU time {time.process_time() - started:.0f} s, tracing included\n")
@@ -210,10 +211,8 @@ def print_lobby(positions: int) -> None:
                 found = torch.tensor([p.away for p in group if p.away < 1.0])
                 error = f"{float(found.median()):.3f}" if len(found) else "-"
                 print(f"| {low} to {high} | {order} | {len(group)} | {len(found)} | {error} |")
-    print(
-        "\nmissed among the wanted\n\n| position | order | below [dB] | to louder mirror [cells] | to estimate [cells] |\n"
-        "|---|---|---|---|---|"
-    )
+    print("\nmissed among the wanted\n")
+    print("| position | order | below [dB] | to louder mirror [cells] | to estimate [cells] |\n|---|---|---|---|---|")
     for path in (path for row in everything for path in row[:WANTED] if path.away >= 1.0):
         print(f"| {path.position} | {path.order} | {path.below_db:.1f} | {path.apart:.1f} | {path.away:.1f} |")
 
