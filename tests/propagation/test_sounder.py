@@ -97,7 +97,7 @@ def test_a_receiver_that_nothing_reaches_has_silence_or_noise(random_paths):
         ({"fov_tx_deg": 200.0}, "fov_tx_deg must be above 0 and up to 180 degrees"),
         ({"averages": 0}, "averages must be at least 1"),
         ({"delay_error": -1e-9}, "averages must be at least 1, delay_error"),
-        ({"points": 50}, r"tell delays up to 5e-08 s; use at least \d+ points"),
+        ({"points": 50}, r"over 1e\+09 Hz tell 5e-08 s; use at least \d+ points"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(random_paths, changes, message):

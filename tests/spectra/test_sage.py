@@ -17,22 +17,29 @@ from benchmarks.quality.sage import (
 )
 
 from rf3dgs.channel.arrays import planar_array
+from rf3dgs.channel.io import load_paths, save_paths
 from rf3dgs.channel.sounding import device_directions, sounder_response
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import equirect_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.propagation.sounder import sound
 from rf3dgs.spectra.apertures import Aperture
+from rf3dgs.spectra.peaks import main_peak
 from rf3dgs.spectra.sage import _Fit, estimate_paths, sage
+from rf3dgs.spectra.scan import spectrum_of
 
 FULL = VIEWS["full"]
 SILENT = replace(SMALL, snr_db=None)
 
 
 def by_delay(paths):
+    """In double precision and the order of delay."""
     order = paths.delay.argsort(-1)
-    return paths._map(lambda value: value.gather(-1, order))
+    columns = paths._map(lambda value: value.gather(-1, order))
+    double = {torch.float32: torch.float64, torch.complex64: torch.complex128}
+    return columns._map(lambda value: value.to(double.get(value.dtype, value.dtype)))
 
 
 def errors_of(view, trials):
@@ -80,9 +87,8 @@ def test_without_noise_the_paths_come_back():
         found = by_delay(sage(sound(truth, SILENT)))
         expected = by_delay(truth)
         assert found.coeff.shape == (3,)
-        assert found.coeff.dtype == torch.complex128
-        # The last sweep moves by less than 1e-9 cells; a cell is 1 ns in delay and about a radian in angle.
-        assert torch.allclose(found.delay, expected.delay, atol=1e-16)
+        # Paths are float32: 1e-7 of 30 ns, of a radian, of a gain. The last sweep moves by less than 1e-9 cells.
+        assert torch.allclose(found.delay, expected.delay, atol=5e-15)
         assert float(angle_between(found.aoa, expected.aoa).max()) < 1e-6
         assert float(angle_between(found.aod, expected.aod).max()) < 1e-6
         assert torch.allclose(found.coeff.abs(), expected.coeff.abs(), rtol=1e-5)
@@ -95,7 +101,7 @@ def test_the_paths_found_explain_the_sounding_down_to_the_noise():
     array_rx, array_tx = sounding.array_rx, sounding.array_tx
     again = sounder_response(found.paths, array_rx, array_tx, sounding.offsets)
     residual = (again - sounding.response).abs().square().mean()
-    assert float(residual) == pytest.approx(float(found.residual_power), rel=1e-6)
+    assert float(residual) == pytest.approx(float(found.residual_power), rel=1e-4)
     # 8192 complex entries less 21 fitted numbers: deviation 1/90 of the noise power.
     assert float(residual / found.noise_power) == pytest.approx(1.0, abs=0.05)
     assert bool(found.converged)
@@ -185,7 +191,7 @@ def test_elements_that_hear_backwards_show_it_mirrored_ahead():
     local = device_directions(truth)[0] * torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
     behind = truth.rx.world_from_device.double() @ local[0]
     zenith, azimuth = torch.acos(behind[2]), torch.atan2(behind[1], behind[0])
-    found = sage(sound(replace(truth, aoa_zenith=zenith[None], aoa_azimuth=azimuth[None]), sounder))
+    found = by_delay(sage(sound(replace(truth, aoa_zenith=zenith[None], aoa_azimuth=azimuth[None]), sounder)))
     assert float(angle_between(found.aoa, truth.aoa)) < 1e-5
 
 
@@ -208,15 +214,12 @@ def test_with_an_unknown_offset_the_earliest_path_is_the_straight_line():
         assert float(angle_between(found.aoa, by_delay(truth).aoa).max()) < 0.05
 
 
-def test_delays_longer_than_the_period_of_a_negative_comb_are_unwrapped():
+def test_delays_longer_than_a_period_are_those_after_the_straight_line():
     truth = three_paths(7, FULL)
-    late = replace(truth, delay=truth.delay + 5e-8, rx=replace_position(truth.rx, (24.0, 0.0, 1.0)))
-    found = by_delay(sage(sound(replace(late, delay=late.delay), replace(SMALL, points=128))))
-    assert torch.allclose(found.delay, by_delay(late).delay, atol=2e-11)
-
-
-def replace_position(pose, position):
-    return Pose(position, pose.orientation)
+    far = replace(truth, delay=truth.delay + 8e-8, rx=Pose((24.0, 0.0, 2.0), truth.rx.orientation))
+    found = by_delay(sage(sound(far, SMALL)))
+    assert float(far.delay.min()) > SMALL.points / SMALL.bandwidth
+    assert torch.allclose(found.delay, by_delay(far).delay, atol=2e-11)
 
 
 @pytest.mark.parametrize(
@@ -237,7 +240,7 @@ def test_ahead_takes_the_untold_zenith_as_the_horizon():
     truth = three_paths(0, FULL)
     level = replace(truth, aoa_zenith=torch.full((3,), math.pi / 2, dtype=torch.float64))
     found = estimate_paths(sound(level, replace(SMALL, array_rx=planar_array(1, 8))), untold="ahead")
-    assert torch.allclose(found.paths.aoa_zenith, torch.tensor(math.pi / 2).double())
+    assert torch.allclose(found.paths.aoa_zenith, torch.tensor(math.pi / 2))
     assert bool(torch.isinf(found.deviation.aoa_zenith).all())
     error = (by_delay(found.paths).aoa_azimuth - by_delay(level).aoa_azimuth).abs()
     assert bool((error < 5 * found.deviation.aoa_azimuth.max()).all())
@@ -269,3 +272,13 @@ def test_the_coarse_grid_starts_within_half_a_cell():
         sounding = sound(truth, SILENT)
         start = Aperture.of(sounding).strongest(sounding.response) / Aperture.of(sounding).cell
         assert float((start - cells(truth, sounding)[0]).abs().max()) < 0.5
+
+
+def test_estimates_go_where_traced_paths_go(tmp_path):
+    truth = three_paths(0, FULL)
+    found = sage(sound(truth, SMALL))
+    save_paths(found, tmp_path / "found.paths")
+    again = load_paths(tmp_path / "found.paths")
+    assert torch.equal(again.delay[0], found.delay)
+    spectrum = spectrum_of(found, grid=equirect_grid(90, 45))
+    assert float(angle_between(main_peak(spectrum), found.aoa[0].float())) < 0.05

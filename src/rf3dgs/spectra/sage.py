@@ -4,7 +4,7 @@ Space-alternating generalized expectation maximisation (Fessler and Hero 1994; F
 after the other, the strongest first, on coarse grids of what the paths before leave over. Then each path in turn is
 given everything that the others do not explain (expectation) and moved uphill in all its parameters (maximisation),
 until none moves by more than a hundredth of its deviation; a joint step of all paths after each sweep shortens the way
-where paths overlap. Everything in complex128; `apertures` has the waves.
+where paths overlap. Everything is computed in complex128; `apertures` has the waves.
 """
 
 import math
@@ -61,7 +61,7 @@ def sage(
     untold: Untold = "refuse",
     progress: Progress | None = None,
 ) -> Paths:
-    """The dominant paths `[*batch, path]` of a sounding, strongest first, in float64 and complex128; `kind` is None.
+    """The dominant paths `[*batch, path]` of a sounding, strongest first; `order` and `kind` are None.
 
     count: how many per receiver; None stops by itself where one more path explains less than its description costs
     (minimum description length), at the latest at `limit`. The noise power counts there; unknown, it is taken from the
@@ -302,8 +302,9 @@ def _columns(fit: _Fit, rows: Sounding, index: int) -> dict[str, Tensor]:
     distance = float((rows.rx.position[index] - rows.tx.position).double().norm())
     centre = float(sounding.offsets.mean())
     delay, shift = _unwrapped(theta[:, 4], sounding, distance)
-    # The wave is centred on the comb and late by its measured delay; the gain sought is at the carrier.
-    turn = centre * (delay + shift) + rows.frequency * delay
+    # The wave is centred on the comb and late by its measured delay; the gain sought is at the carrier. Its phase is
+    # taken off for the delay as it will be stored, rounded to float32.
+    turn = centre * (delay + shift) + rows.frequency * delay.float().double()
     turn = torch.remainder(turn, 1.0)
     coeff = fit.gain / level * torch.polar(torch.ones_like(turn), 2 * math.pi * turn)
     aoa = angles_of(arrival @ rows.rx.world_from_device[index].double().mT)
@@ -319,7 +320,8 @@ def _columns(fit: _Fit, rows: Sounding, index: int) -> dict[str, Tensor]:
         "valid": torch.ones(len(delay), dtype=torch.bool),
         "lost": lost,
     }
-    return {name: value[order] for name, value in values.items()}
+    values = {name: value.float() if value.dtype == torch.float64 else value for name, value in values.items()}
+    return {name: value[order] for name, value in {**values, "coeff": coeff.to(torch.complex64)}.items()}
 
 
 def _unwrapped(delay: Tensor, sounding: Sounding, distance: float) -> tuple[Tensor, Tensor]:
