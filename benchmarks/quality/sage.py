@@ -37,6 +37,7 @@ SMALL = Sounder(points=64, array_rx=planar_array(4, 4, "patch"), array_tx=planar
 LARGE = Sounder(points=256, array_rx=planar_array(8, 8, "patch"), array_tx=planar_array(4, 4, "patch"), snr_db=20.0)
 VIEWS = {"full": (180.0, 180.0), "receiver 45 deg": (45.0, 180.0), "both 45 deg": (45.0, 45.0)}
 WANTED = 4  # paths per position of the lobby
+LIMIT = 12  # paths that SAGE may report there
 FAR = 99.0
 
 
@@ -155,8 +156,8 @@ def lobby_positions(count: int, seed: int = 11):
 
     site = lobby()
     rx = Pose.look_at(site.receivers(count, seed=seed).position, site.tx.position)
-    for row in trace_each(site, None, rx, TraceConfig(rays=100_000)):
-        yield bin_diffuse(row[0], cell=math.radians(2.0), delay_step=0.25 / LARGE.bandwidth)
+    for row in trace_each(site, None, rx, TraceConfig(rays=50_000)):
+        yield bin_diffuse(row[0], cell=math.radians(3.0), delay_step=0.5 / LARGE.bandwidth)
 
 
 def _distance(first: Tensor, second: Tensor) -> Tensor:
@@ -188,11 +189,12 @@ def print_trials(trials: int) -> None:
 
 
 def print_lobby(positions: int) -> None:
-    print(f"\nlobby, {positions} positions; wanted: the {WANTED} loudest resolvable of line of sight and mirrors")
+    print(f"\nlobby, {positions} positions, up to {LIMIT} paths each")
+    print(f"wanted: the {WANTED} loudest of line of sight and mirrors that can be resolved\n")
     everything, started = [], time.process_time()
     for position, paths in enumerate(lobby_positions(positions)):
         sounding = sound(paths, LARGE)
-        estimate = estimate_paths(sounding)
+        estimate = estimate_paths(sounding, limit=LIMIT)
         everything.append(wanted_paths(paths, sounding, estimate.paths, position, most=12))
         left = float(estimate.residual_power / estimate.noise_power)
         print(

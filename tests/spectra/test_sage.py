@@ -5,6 +5,7 @@ import pytest
 import torch
 from benchmarks.quality.sage import LARGE as LOBBY_SOUNDER
 from benchmarks.quality.sage import (
+    LIMIT,
     QUANTITIES,
     SMALL,
     VIEWS,
@@ -27,7 +28,8 @@ from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.propagation.sounder import sound
 from rf3dgs.spectra.apertures import Aperture
 from rf3dgs.spectra.peaks import main_peak
-from rf3dgs.spectra.sage import _Fit, estimate_paths, sage
+from rf3dgs.spectra.sage import estimate_paths, sage
+from rf3dgs.spectra.sage_fit import Fit
 from rf3dgs.spectra.scan import spectrum_of
 
 FULL = VIEWS["full"]
@@ -75,7 +77,7 @@ def test_loudest_reflections_of_the_lobby_are_found_within_a_cell():
     whole = 0
     for position, paths in enumerate(lobby_positions(20)):
         sounding = sound(paths, LOBBY_SOUNDER)
-        wanted = wanted_paths(paths, sounding, sage(sounding), position, most=WANTED)
+        wanted = wanted_paths(paths, sounding, sage(sounding, limit=LIMIT), position, most=WANTED)
         assert len(wanted) == WANTED
         whole += all(path.away < 1.0 for path in wanted)
     assert whole >= 19
@@ -173,7 +175,7 @@ def test_overlapping_paths_are_told_apart_at_high_snr():
 
 def test_no_sweep_and_no_leap_explains_less():
     sounding = sound(three_paths(2, FULL), SMALL)
-    fit = _Fit(Aperture.of(sounding), sounding.response, None)
+    fit = Fit(Aperture.of(sounding), sounding.response, None)
     generator = torch.Generator().manual_seed(0)
     theta = torch.rand(4, 5, generator=generator, dtype=torch.float64) * fit.aperture.cell * 0.4
     fit._set(theta, torch.zeros(4, dtype=torch.complex128))
@@ -220,6 +222,19 @@ def test_delays_longer_than_a_period_are_those_after_the_straight_line():
     found = by_delay(sage(sound(far, SMALL)))
     assert float(far.delay.min()) > SMALL.points / SMALL.bandwidth
     assert torch.allclose(found.delay, by_delay(far).delay, atol=2e-11)
+
+
+@pytest.mark.parametrize("points", [64, 63])
+def test_unwrapped_paths_explain_the_sounding_on_any_comb(points):
+    truth = three_paths(7, FULL)
+    far = replace(truth, delay=truth.delay + 8e-8, rx=Pose((24.0, 0.0, 2.0), truth.rx.orientation))
+    sounding = sound(far, replace(SMALL, points=points))
+    offsets = sounding.offsets + 0.3e6
+    response = sounder_response(far, sounding.array_rx, sounding.array_tx, offsets)
+    found = sage(replace(sounding, response=response, offsets=offsets, noise_power=None))
+    again = sounder_response(found, sounding.array_rx, sounding.array_tx, offsets)
+    # Paths are float32: phases at 60 GHz are exact to 1e-3, amplitudes to 1e-7.
+    assert float((again - response).abs().square().mean() / response.abs().square().mean()) < 1e-5
 
 
 @pytest.mark.parametrize(
