@@ -12,6 +12,7 @@ from rf3dgs.channel.arrays import ofdm, planar_array
 from rf3dgs.channel.sounding import Sounding
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose
+from rf3dgs.propagation.mat5 import read_mat5
 from rf3dgs.propagation.measured import read_sounding, write_sounding
 
 SUFFIXES = [".h5", ".hdf5", ".mat", ".csv"]
@@ -160,8 +161,8 @@ def test_a_plain_matlab_file_is_read(tmp_path):
         ({"rx_position": np.full((2, 3), np.nan)}, "'rx_position' must be finite real numbers"),
         ({"noise_power": np.array([-1.0, 1.0])}, "noise_power must be"),
         ({"response": np.full((2, 1, 1, 5), np.nan)}, "NaN or infinite"),
-        ({"response": {"real": 1.0}}, "'response' must be an array of numbers or text; got a MATLAB struct"),
-        ({"response": "loud"}, "'response' must be numbers"),
+        ({"response": {"real": 1.0}}, "'response' must be numbers or text; got a MATLAB struct"),
+        ({"response": "loud"}, "expected the field 'response', complex"),
         ({"response": np.ones((2, 1, 1, 1, 5))}, r"'response' must be \[position, rx_ant, tx_ant, frequency\]"),
     ],
 )
@@ -250,3 +251,46 @@ def test_hdf5_parts_of_different_shape_are_refused(tmp_path):
         file["response_imag"] = np.zeros((1, 4, 3, 6))
     with pytest.raises(DataError, match="'response_real' and 'response_imag' differ in shape"):
         read_sounding(path)
+
+
+def test_damage_to_an_unpacked_matlab_file_is_one_error_or_none(tmp_path):
+    path = matlab(tmp_path / "site.mat", array_rx=np.array([1.0, 1.0, 0.5, 0.5]), pattern_rx="patch")
+    whole, generator = path.read_bytes(), np.random.default_rng(1)
+    refused = 0
+    for place in generator.integers(128, len(whole), 400):
+        damaged = bytearray(whole)
+        damaged[place] = int(generator.integers(256))
+        path.write_bytes(bytes(damaged))
+        error = error_of(path)
+        refused += error is not None
+        assert error is None or "site.mat" in error
+    assert refused > 100
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_matlab_variables_are_read_as_scipy_wrote_them(tmp_path, packed):
+    path, generator = tmp_path / "some.mat", np.random.default_rng(0)
+    wanted = {
+        "cube": generator.normal(size=(2, 3, 4)) + 1j * generator.normal(size=(2, 3, 4)),
+        "small": np.arange(6, dtype=np.int8).reshape(2, 3),
+        "single": np.float32(0.5),
+        "yes": np.array([True, False]),
+        "nothing": np.zeros((0, 3)),
+        "text": "grüße",
+    }
+    scipy.io.savemat(path, {**wanted, "other": {"a": [1, 2]}}, do_compression=packed)
+    found = read_mat5(path, tuple(wanted))
+    assert set(found) == set(wanted)
+    assert found["text"] == wanted["text"]
+    for name in ("cube", "small", "single", "yes", "nothing"):
+        assert np.array_equal(found[name], np.atleast_2d(wanted[name])), name
+
+
+def test_matlab_text_of_several_lines_and_variables_twice_are_refused(tmp_path):
+    path = matlab(tmp_path / "site.mat", pattern_rx=np.array(["patch", "ghost"]))
+    with pytest.raises(DataError, match="'pattern_rx' must be one line of text"):
+        read_sounding(path)
+    once = matlab(tmp_path / "site.mat").read_bytes()
+    (tmp_path / "site.mat").write_bytes(once + once[128:])
+    with pytest.raises(DataError, match=r"site\.mat.*occurs twice"):
+        read_sounding(tmp_path / "site.mat")
