@@ -5,9 +5,10 @@
 First table: scenes of three random paths at 20 dB SNR, each at least one and a half resolution cells apart in one
 dimension; root mean square of error over bound, and how many trials found three paths. Second: the built-in lobby
 traced to random receivers that look at the transmitter, sounded over 1 GHz between 8x8 and 4x4 patches at 20 dB SNR.
-Wanted in each position are the line of sight and the three mirror paths that the sounder hears loudest, leaving out
-those within one resolution cell of a louder one; found is a path with an estimate less than one cell away in delay and
-in all direction cosines.
+Mirror paths, the line of sight among them, are taken in the order in which the sounder hears them, leaving out those
+within one resolution cell of a louder one. Found is a path with an estimate less than one cell away in delay and in all
+direction cosines. Wanted are up to four per position that stand out: at least 6 dB above the diffuse power that a
+filter matched to the path lets through. The others are listed too.
 """
 
 import argparse
@@ -37,6 +38,7 @@ SMALL = Sounder(points=64, array_rx=planar_array(4, 4, "patch"), array_tx=planar
 LARGE = Sounder(points=256, array_rx=planar_array(8, 8, "patch"), array_tx=planar_array(4, 4, "patch"), snr_db=20.0)
 VIEWS = {"full": (180.0, 180.0), "receiver 45 deg": (45.0, 180.0), "both 45 deg": (45.0, 45.0)}
 WANTED = 4  # paths per position of the lobby
+STANDS_OUT_DB = 6.0
 LIMIT = 12  # paths that SAGE may report there
 FAR = 99.0
 
@@ -104,49 +106,73 @@ def normalised_errors(seed: int, view: tuple[float, float], *, noise_known: bool
 
 @dataclass(frozen=True)
 class Wanted:
-    """A path of the lobby that SAGE was to find, and how near the nearest estimate is."""
+    """A mirror path of the lobby, what is in its way, and how near the nearest estimate is."""
 
     position: int
     order: int
     below_db: float
-    """Level heard below the loudest path of the position [dB]."""
+    """Level heard below the loudest mirror path of the position [dB]."""
+    over_db: float
+    """Level over the diffuse power that a filter matched to the path lets through [dB]."""
     apart: float
     """Distance to the nearest louder mirror path [cells]."""
     away: float
     """Distance to the nearest estimate [cells]."""
-    level_db: float
-    """Level of that estimate over the path's [dB]."""
 
 
-def wanted_paths(paths: Paths, sounding: Sounding, found: Paths, position: int, most: int) -> list[Wanted]:
+def mirror_paths(paths: Paths, sounding: Sounding, found: Paths, position: int, most: int = 12) -> list[Wanted]:
     """The loudest resolvable mirror paths of one position `[path]`, line of sight included."""
     assert paths.kind is not None
     assert paths.order is not None
-    arrival, departure = device_directions(paths)
     array_rx, array_tx = sounding.array_rx, sounding.array_tx
     assert array_rx is not None
     assert array_tx is not None
-    keep = (paths.kind & DIFFUSE) == 0
-    keep &= seen(array_rx, sounding.fov_rx, arrival) & seen(array_tx, sounding.fov_tx, departure)
+    arrival, departure = device_directions(paths)
+    in_view = seen(array_rx, sounding.fov_rx, arrival) & seen(array_tx, sounding.fov_tx, departure)
     element = power_pattern(array_rx.pattern, arrival) * power_pattern(array_tx.pattern, departure)
-    heard = db_from_power(paths.path_gain.double() * element)[keep]
-    mirrors = paths._map(lambda value: value[keep])
-    place, estimate = cells(mirrors, sounding), cells(found, sounding)
-    apart, away = _distance(place, place), _distance(place, estimate)
-    own, level = db_from_power(mirrors.path_gain), db_from_power(found.path_gain)
+    heard, diffuse = paths.path_gain.double() * element, (paths.kind & DIFFUSE) != 0
+    keep = in_view & ~diffuse
+    place, estimate = cells(paths, sounding), cells(found, sounding)
+    clutter = let_through(sounding, place[keep], place[diffuse], heard[diffuse])
+    level, over = db_from_power(heard[keep]), db_from_power(heard[keep] / clutter)
+    order = paths.order[keep]
+    apart, away = _distance(place[keep], place[keep]), _distance(place[keep], estimate)
     result = []
-    for index in heard.argsort(descending=True).tolist():
-        louder = apart[index][heard > heard[index]]
+    for index in level.argsort(descending=True).tolist():
+        louder = apart[index][level > level[index]]
         gap = float(louder.min()) if len(louder) else FAR
         if gap < 1.0:
             continue
         nearest = int(away[index].argmin())
-        below, order = float(heard.max() - heard[index]), int(mirrors.order[index]) if mirrors.order is not None else -1
-        offset = float(level[nearest] - own[index])
-        result.append(Wanted(position, order, below, gap, float(away[index, nearest]), offset))
+        result.append(
+            Wanted(
+                position=position,
+                order=int(order[index]),
+                below_db=float(level.max() - level[index]),
+                over_db=float(over[index]),
+                apart=gap,
+                away=float(away[index, nearest]),
+            )
+        )
         if len(result) == most:
             break
     return result
+
+
+def wanted_of(row: list[Wanted]) -> list[Wanted]:
+    """The loudest of one position that stand out from the diffuse power."""
+    return [path for path in row if path.over_db >= STANDS_OUT_DB][:WANTED]
+
+
+def let_through(sounding: Sounding, place: Tensor, sources: Tensor, power: Tensor) -> Tensor:
+    """Mean power `[path]` of incoherent `sources` at the output of filters matched to the waves at `place` [cells]."""
+    aperture = Aperture.of(sounding)
+    mine, total = aperture.waves(place * aperture.cell), torch.zeros(len(place), dtype=torch.float64)
+    for part in torch.arange(len(sources)).split(4096):
+        theirs = aperture.waves(sources[part] * aperture.cell)
+        shares = [(a.conj() @ b.mT / a.shape[1]).abs().square() for a, b in zip(mine, theirs, strict=True)]
+        total += (shares[0] * shares[1] * shares[2]) @ power[part]
+    return total.clamp_min(1e-300)
 
 
 def lobby_positions(count: int, seed: int = 11):
@@ -189,13 +215,12 @@ def print_trials(trials: int) -> None:
 
 
 def print_lobby(positions: int) -> None:
-    print(f"\nlobby, {positions} positions, up to {LIMIT} paths each")
-    print(f"wanted: the {WANTED} loudest of line of sight and mirrors that can be resolved\n")
+    print(f"\nlobby, {positions} positions, up to {LIMIT} paths each\n")
     everything, started = [], time.process_time()
     for position, paths in enumerate(lobby_positions(positions)):
         sounding = sound(paths, LARGE)
         estimate = estimate_paths(sounding, limit=LIMIT)
-        everything.append(wanted_paths(paths, sounding, estimate.paths, position, most=12))
+        everything.append(mirror_paths(paths, sounding, estimate.paths, position))
         left = float(estimate.residual_power / estimate.noise_power)
         print(
             f"position {position}: {len(paths.delay)} paths, {estimate.paths.coeff.shape[-1]} found, "
@@ -203,20 +228,39 @@ def print_lobby(positions: int) -> None:
             flush=True,
         )
     print(f"CPU time {time.process_time() - started:.0f} s, tracing included\n")
-    whole = sum(all(path.away < 1.0 for path in row[:WANTED]) for row in everything)
-    print(f"line of sight and {WANTED - 1} loudest reflections all found in {whole} of {len(everything)} positions\n")
-    print("| heard below the loudest [dB] | order | paths | found | median error [cells] |\n|---|---|---|---|---|")
-    for low, high in ((0, 10), (10, 20), (20, 30), (30, 40), (40, 60)):
+    rows = [wanted_of(row) for row in everything]
+    rows = [row for row in rows if row]
+    whole = sum(all(path.away < 1.0 for path in row) for row in rows)
+    print(f"{len(rows)} of {positions} positions have mirror paths that stand out, {sum(map(len, rows))} in all;")
+    print(f"all of them are found in {whole} positions ({100 * whole / len(rows):.0f} %)\n")
+    print("| over diffuse power [dB] | order | paths | below the loudest [dB] | found | median error [cells] |")
+    print("|---|---|---|---|---|---|")
+    for low, high in ((20, 999), (6, 20), (0, 6), (-10, 0), (-999, -10)):
         for order in range(4):
-            group = [p for row in everything for p in row if low <= p.below_db < high and p.order == order]
+            group = [p for row in everything for p in row if low <= p.over_db < high and p.order == order]
             if group:
-                found = torch.tensor([p.away for p in group if p.away < 1.0])
-                error = f"{float(found.median()):.3f}" if len(found) else "-"
-                print(f"| {low} to {high} | {order} | {len(group)} | {len(found)} | {error} |")
-    print("\nmissed among the wanted\n")
-    print("| position | order | below [dB] | to louder mirror [cells] | to estimate [cells] |\n|---|---|---|---|---|")
-    for path in (path for row in everything for path in row[:WANTED] if path.away >= 1.0):
-        print(f"| {path.position} | {path.order} | {path.below_db:.1f} | {path.apart:.1f} | {path.away:.1f} |")
+                print(f"| {_between(low, high)} | {order} | {len(group)} | {_summary(group)} |")
+    print("\nmissed among the wanted, and the loudest missed of the others\n")
+    print("| position | order | below [dB] | over diffuse [dB] | to louder mirror [cells] | to estimate [cells] |")
+    print("|---|---|---|---|---|---|")
+    missed = [path for row in everything for path in row if path.away >= 1.0]
+    masked = sorted((path for path in missed if path.over_db < STANDS_OUT_DB), key=lambda path: path.below_db)
+    for path in [path for row in rows for path in row if path.away >= 1.0] + masked[:8]:
+        print(
+            f"| {path.position} | {path.order} | {path.below_db:.1f} | {path.over_db:.1f} | {path.apart:.1f} "
+            f"| {path.away:.1f} |"
+        )
+
+
+def _between(low: float, high: float) -> str:
+    return f"above {low}" if high > 100 else f"below {high}" if low < -100 else f"{low} to {high}"
+
+
+def _summary(group: list[Wanted]) -> str:
+    found = torch.tensor([path.away for path in group if path.away < 1.0])
+    error = f"{float(found.median()):.3f}" if len(found) else "-"
+    below = [path.below_db for path in group]
+    return f"{min(below):.0f} to {max(below):.0f} | {len(found)} | {error}"
 
 
 def main() -> None:
