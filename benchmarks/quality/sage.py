@@ -7,8 +7,8 @@ dimension; root mean square of error over bound, and how many trials found three
 traced to random receivers that look at the transmitter, sounded over 1 GHz between 8x8 and 4x4 patches at 20 dB SNR.
 Mirror paths, the line of sight among them, are taken in the order in which the sounder hears them, leaving out those
 within one resolution cell of a louder one. Found is a path with an estimate less than one cell away in delay and in all
-direction cosines. Wanted are up to four per position that stand out: at least 6 dB above the diffuse power that a
-filter matched to the path lets through. The others are listed too.
+direction cosines. Wanted are those that dominate: heard within 25 dB of everything that is heard, and at least 6 dB
+above the diffuse power that a filter matched to the path lets through. The others are listed too.
 """
 
 import argparse
@@ -37,8 +37,7 @@ QUANTITIES = ("delay", "aoa_zenith", "aoa_azimuth", "aod_zenith", "aod_azimuth")
 SMALL = Sounder(points=64, array_rx=planar_array(4, 4, "patch"), array_tx=planar_array(2, 4, "isotropic"), snr_db=20.0)
 LARGE = Sounder(points=256, array_rx=planar_array(8, 8, "patch"), array_tx=planar_array(4, 4, "patch"), snr_db=20.0)
 VIEWS = {"full": (180.0, 180.0), "receiver 45 deg": (45.0, 180.0), "both 45 deg": (45.0, 45.0)}
-WANTED = 4  # paths per position of the lobby
-STANDS_OUT_DB = 6.0
+WEAKEST_DB, STANDS_OUT_DB = -25.0, 6.0  # of all power heard, over the diffuse power let through
 LIMIT = 12  # paths that SAGE may report there
 FAR = 99.0
 
@@ -110,8 +109,8 @@ class Wanted:
 
     position: int
     order: int
-    below_db: float
-    """Level heard below the loudest mirror path of the position [dB]."""
+    share_db: float
+    """Power heard over that of all paths, diffuse ones included [dB]."""
     over_db: float
     """Level over the diffuse power that a filter matched to the path lets through [dB]."""
     apart: float
@@ -135,7 +134,7 @@ def mirror_paths(paths: Paths, sounding: Sounding, found: Paths, position: int, 
     place, estimate = cells(paths, sounding), cells(found, sounding)
     clutter = let_through(sounding, place[keep], place[diffuse], heard[diffuse])
     level, over = db_from_power(heard[keep]), db_from_power(heard[keep] / clutter)
-    order = paths.order[keep]
+    order, everything = paths.order[keep], db_from_power(heard[in_view].sum())
     apart, away = _distance(place[keep], place[keep]), _distance(place[keep], estimate)
     result = []
     for index in level.argsort(descending=True).tolist():
@@ -148,7 +147,7 @@ def mirror_paths(paths: Paths, sounding: Sounding, found: Paths, position: int, 
             Wanted(
                 position=position,
                 order=int(order[index]),
-                below_db=float(level.max() - level[index]),
+                share_db=float(level[index] - everything),
                 over_db=float(over[index]),
                 apart=gap,
                 away=float(away[index, nearest]),
@@ -160,8 +159,8 @@ def mirror_paths(paths: Paths, sounding: Sounding, found: Paths, position: int, 
 
 
 def wanted_of(row: list[Wanted]) -> list[Wanted]:
-    """The loudest of one position that stand out from the diffuse power."""
-    return [path for path in row if path.over_db >= STANDS_OUT_DB][:WANTED]
+    """Those of one position that dominate."""
+    return [path for path in row if path.share_db >= WEAKEST_DB and path.over_db >= STANDS_OUT_DB]
 
 
 def let_through(sounding: Sounding, place: Tensor, sources: Tensor, power: Tensor) -> Tensor:
@@ -231,36 +230,35 @@ def print_lobby(positions: int) -> None:
     rows = [wanted_of(row) for row in everything]
     rows = [row for row in rows if row]
     whole = sum(all(path.away < 1.0 for path in row) for row in rows)
-    print(f"{len(rows)} of {positions} positions have mirror paths that stand out, {sum(map(len, rows))} in all;")
-    print(f"all of them are found in {whole} positions ({100 * whole / len(rows):.0f} %)\n")
-    print("| over diffuse power [dB] | order | paths | below the loudest [dB] | found | median error [cells] |")
+    print(f"{len(rows)} of {positions} positions have mirror paths that dominate, {sum(map(len, rows))} in all;")
+    print(f"all of them are found in {whole} of these positions ({100 * whole / max(len(rows), 1):.0f} %)\n")
+    print("| of all power heard [dB] | over diffuse [dB] | order | paths | found | median error [cells] |")
     print("|---|---|---|---|---|---|")
-    for low, high in ((20, 999), (6, 20), (0, 6), (-10, 0), (-999, -10)):
-        for order in range(4):
-            group = [p for row in everything for p in row if low <= p.over_db < high and p.order == order]
-            if group:
-                print(f"| {_between(low, high)} | {order} | {len(group)} | {_summary(group)} |")
-    print("\nmissed among the wanted, and the loudest missed of the others\n")
-    print("| position | order | below [dB] | over diffuse [dB] | to louder mirror [cells] | to estimate [cells] |")
+    for shares in ((-10, 1), (-20, -10), (-25, -20), (-30, -25), (-40, -30), (-99, -40)):
+        for overs in ((STANDS_OUT_DB, 999), (-999, STANDS_OUT_DB)):
+            for order in range(4):
+                group = [p for row in everything for p in row if shares[0] <= p.share_db < shares[1]]
+                group = [p for p in group if overs[0] <= p.over_db < overs[1] and p.order == order]
+                if group:
+                    print(f"| {shares[0]} to {shares[1]} | {_over(overs)} | {order} | {_summary(group)} |")
+    print("\nthe loudest missed\n")
+    print("| position | order | of all [dB] | over diffuse [dB] | to louder mirror [cells] | to estimate [cells] |")
     print("|---|---|---|---|---|---|")
     missed = [path for row in everything for path in row if path.away >= 1.0]
-    masked = sorted((path for path in missed if path.over_db < STANDS_OUT_DB), key=lambda path: path.below_db)
-    for path in [path for row in rows for path in row if path.away >= 1.0] + masked[:8]:
+    for path in sorted(missed, key=lambda path: -path.share_db)[:12]:
         print(
-            f"| {path.position} | {path.order} | {path.below_db:.1f} | {path.over_db:.1f} | {path.apart:.1f} "
+            f"| {path.position} | {path.order} | {path.share_db:.1f} | {path.over_db:.1f} | {path.apart:.1f} "
             f"| {path.away:.1f} |"
         )
 
 
-def _between(low: float, high: float) -> str:
-    return f"above {low}" if high > 100 else f"below {high}" if low < -100 else f"{low} to {high}"
+def _over(overs: tuple[float, float]) -> str:
+    return f"at least {overs[0]:.0f}" if overs[1] > 100 else f"below {overs[1]:.0f}"
 
 
 def _summary(group: list[Wanted]) -> str:
     found = torch.tensor([path.away for path in group if path.away < 1.0])
-    error = f"{float(found.median()):.3f}" if len(found) else "-"
-    below = [path.below_db for path in group]
-    return f"{min(below):.0f} to {max(below):.0f} | {len(found)} | {error}"
+    return f"{len(group)} | {len(found)} | " + (f"{float(found.median()):.3f}" if len(found) else "-")
 
 
 def main() -> None:
