@@ -73,14 +73,16 @@ def test_a_hundred_trials_stay_within_one_and_a_half_bounds(view):
 
 
 @pytest.mark.slow
-def test_loudest_reflections_of_the_lobby_are_found_within_a_cell():
+def test_where_the_lobby_has_a_line_of_sight_all_dominant_mirrors_are_found_within_a_cell():
     rows = []
     for position, paths in enumerate(lobby_positions(20)):
         sounding = sound(paths, LOBBY_SOUNDER)
         rows.append(wanted_of(mirror_paths(paths, sounding, sage(sounding, limit=LIMIT), position)))
-    rows = [row for row in rows if row]
-    assert len(rows) >= 15
-    assert sum(all(path.away < 1.0 for path in row) for row in rows) >= 0.95 * len(rows)
+    in_sight = [row for row in rows if any(path.order == 0 for path in row)]
+    assert len(in_sight) >= 15
+    assert sum(all(path.away < 1.0 for path in row) for row in in_sight) >= 0.95 * len(in_sight)
+    # Without line of sight diffuse power is louder than any mirror: docs/how-to/sounding.md says what is missed there.
+    assert sum(all(path.away < 1.0 for path in row) for row in rows) >= 0.8 * len(rows)
 
 
 def test_without_noise_the_paths_come_back():
