@@ -1,12 +1,9 @@
 """The containers of measured soundings: named fields to and from HDF5, MATLAB 5 and CSV; `measured` says which fields.
 
-All are of unknown origin when read, so each is bounded before it is opened: HDF5 by its audit, MATLAB files by
-unpacking every compressed element up to a limit, CSV by its size. What is not a known field is left alone.
+All are of unknown origin when read, so each is bounded before it is opened: HDF5 by its audit, MATLAB files by a reader
+of their own (`mat5`), CSV by its size. What is not a known field is left alone.
 """
 
-import struct
-import warnings
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -15,6 +12,7 @@ import numpy as np
 
 from rf3dgs.core.errors import DataError
 from rf3dgs.core.hdf5 import LIBVER, open_audited, read_array, read_attribute, write_text
+from rf3dgs.propagation.mat5 import read_mat5
 
 Fields = Mapping[str, np.ndarray | str]
 
@@ -38,11 +36,6 @@ NUMBERS = (
 COLUMNS = "position,rx_ant,tx_ant,offset,real,imag"
 MAX_BYTES = 2 * 2**30
 MAX_CSV_BYTES = 512 * 2**20
-MAX_RATIO = 200  # unpacked bytes per byte of a MATLAB file
-ALWAYS_ALLOWED = 64 * 2**20
-MAT_COMPRESSED, MAT_MATRIX = 15, 14
-MAT_CLASSES = {"double", "single", "char", "logical"}
-MAT_CLASSES |= {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)}
 
 
 def read_hdf5(path: Path) -> Fields:
@@ -85,32 +78,7 @@ def write_hdf5(path: Path, fields: Fields) -> None:
 
 def read_mat(path: Path) -> Fields:
     """The fields that are variables of a MATLAB 5 file."""
-    from scipy.io import loadmat, whosmat
-
-    _check_mat(path)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # scipy warns of variables that occur twice
-            listed = whosmat(path, appendmat=False)
-            chosen = [(name, shape, kind) for name, shape, kind in listed if name in (*NUMBERS, *TEXTS)]
-            for name, _, kind in chosen:
-                if kind not in MAT_CLASSES:
-                    raise DataError(f"{path}: {name!r} must be an array of numbers or text; got a MATLAB {kind}")
-            loaded = loadmat(path, appendmat=False, variable_names=[name for name, _, _ in chosen])
-    except DataError:
-        raise
-    except Exception as error:  # a damaged file makes scipy raise almost anything
-        raise DataError(f"{path}: the MATLAB file is damaged ({error}); write it again") from error
-    fields: dict[str, np.ndarray | str] = {}
-    for name, _, _ in chosen:
-        value = np.asarray(loaded[name])
-        if name in TEXTS and value.dtype.kind == "U" and value.size == 1:
-            fields[name] = str(value.reshape(-1)[0])
-        elif value.dtype.kind in "biufc":
-            fields[name] = value
-        else:
-            raise DataError(f"{path}: {name!r} must be {'text' if name in TEXTS else 'numbers'}; it is something else")
-    return fields
+    return read_mat5(path, (*NUMBERS, *TEXTS))
 
 
 def write_mat(path: Path, fields: Fields) -> None:
@@ -118,43 +86,6 @@ def write_mat(path: Path, fields: Fields) -> None:
     from scipy.io import savemat
 
     savemat(path, dict(fields), do_compression=True, oned_as="row")
-
-
-def _check_mat(path: Path) -> None:
-    """Refuse other versions, and files whose elements unpack to more than their size explains."""
-    size = path.stat().st_size
-    if size > MAX_BYTES:
-        raise DataError(f"{path}: has {size} bytes; expected at most {MAX_BYTES}, split it")
-    data = path.read_bytes()
-    if data.startswith(b"MATLAB 7.3"):
-        raise DataError(f"{path}: is a MATLAB 7.3 file; save it with -v7, or use HDF5 of this package's layout")
-    if len(data) < 136 or data[126:128] not in (b"IM", b"MI"):
-        raise DataError(f"{path}: expected a MATLAB 5 file (save -v7); it is truncated, damaged or another format")
-    order = "<" if data[126:128] == b"IM" else ">"
-    allowed = min(MAX_BYTES, max(ALWAYS_ALLOWED, MAX_RATIO * size))
-    at = 128
-    while at < size:
-        if at + 8 > size:
-            raise DataError(f"{path}: the MATLAB file is truncated; copy it again")
-        kind, length = struct.unpack_from(f"{order}II", data, at)
-        if kind not in (MAT_COMPRESSED, MAT_MATRIX) or at + 8 + length > size:
-            raise DataError(f"{path}: the MATLAB file is truncated or damaged; copy it again")
-        if kind == MAT_COMPRESSED:
-            allowed -= _unpacked_size(data[at + 8 : at + 8 + length], allowed, path)
-        at += 8 + length
-
-
-def _unpacked_size(packed: bytes, allowed: int, path: Path) -> int:
-    unpacker, total, rest = zlib.decompressobj(), 0, packed
-    try:
-        while rest and not unpacker.eof:
-            total += len(unpacker.decompress(rest, 2**20))
-            rest = unpacker.unconsumed_tail
-            if total > allowed:
-                raise DataError(f"{path}: unpacks to far more than the file's size explains; it is damaged or hostile")
-    except zlib.error as error:
-        raise DataError(f"{path}: a compressed part of the MATLAB file is damaged; copy it again") from error
-    return total
 
 
 def read_csv(path: Path) -> Fields:

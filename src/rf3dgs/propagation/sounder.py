@@ -10,6 +10,7 @@ from rf3dgs.channel.arrays import PlanarArray, ofdm
 from rf3dgs.channel.paths import Paths
 from rf3dgs.channel.sounding import Sounding, sounder_response
 from rf3dgs.core.errors import InputError
+from rf3dgs.core.units import shortest_delay
 
 BOLTZMANN = 1.380649e-23  # [J/K], exact
 ROOM_TEMPERATURE = 290.0  # [K], to which noise figures refer
@@ -60,8 +61,8 @@ def sound(paths: Paths, sounder: Sounder) -> Sounding:
 
     Coherent, with the carrier's phase. Receiver i draws noise and errors from `sounder.seed + i`. A receiver that
     nothing reaches has responses of noise, or of zero where noise is relative (`snr_db`).
-    InputError for settings that contradict each other, and where visible paths within 60 dB of the strongest are later
-    than points / bandwidth, because they would come out too early by that.
+    InputError for settings that contradict each other, and where paths within 60 dB of the strongest are later than the
+    straight line by more than points / bandwidth, because they would come out too early by that.
     """
     _check(sounder)
     offsets = ofdm(sounder.bandwidth, sounder.points)
@@ -118,13 +119,20 @@ def _check(sounder: Sounder) -> None:
 
 
 def _check_delays(paths: Paths, sounder: Sounder) -> None:
-    strong = paths.path_gain >= 1e-6 * paths.path_gain.amax(-1, keepdim=True) if paths.coeff.shape[-1] else paths.valid
-    strong &= paths.valid & (paths.path_gain > 0)
+    """Refuse delays that differ from those of light over the straight line by more than the comb tells."""
+    if sounder.points == 1 or not paths.coeff.shape[-1]:
+        return
+    gain = paths.path_gain
+    strong = (gain > 0) & (gain >= 1e-6 * gain.amax(-1, keepdim=True))
     if not bool(strong.any()):
         return
-    latest, longest = float(paths.delay[strong].max()), sounder.points / sounder.bandwidth
-    if sounder.points > 1 and latest >= longest:
+    distance = torch.linalg.vector_norm((paths.rx.position - paths.tx.position).double(), dim=-1)
+    earliest = torch.as_tensor(shortest_delay(distance.numpy()), dtype=torch.float64).clamp_min(0.0)
+    late = float((paths.delay.double() - earliest[..., None])[strong].max())
+    longest = sounder.points / sounder.bandwidth
+    if late >= longest:
+        points = math.ceil(late * sounder.bandwidth) + 1
         raise InputError(
-            f"paths arrive up to {latest:.3g} s late, but {sounder.points} points over {sounder.bandwidth:g} Hz tell "
-            f"delays up to {longest:.3g} s; use at least {math.ceil(latest * sounder.bandwidth) + 1} points"
+            f"paths arrive up to {late:.3g} s after the straight line, but {sounder.points} points over "
+            f"{sounder.bandwidth:g} Hz tell {longest:.3g} s; use at least {points} points"
         )

@@ -70,25 +70,21 @@ class Aperture:
         return (pairs.mT @ e).reshape(self.rx.shape[1], self.tx.shape[1], self.comb.shape[1])
 
     def correlate(self, theta: Tensor, x: Tensor) -> Tensor:
-        """<s, x> and <q_d s, x> for the five axes, `[6]`, of the wave theta `[5]` with a response x."""
+        """<s, x> and <q_d s, x> for the five axes, `[path, 6]`, of the waves theta `[path, 5]` with a response x."""
         a, b, e = self._weighted(theta)
-        late = x @ e.mT
-        left = (a @ late.reshape(len(x), -1)).reshape(3, -1, 2)
-        return _orders(b[:, None, :, None] * left[None])
+        late = (x @ e.reshape(-1, e.shape[-1]).mT).reshape(*x.shape[:2], len(theta), 2)
+        left = (a @ late.permute(2, 0, 1, 3).flatten(2)).unflatten(2, late.shape[1::2])
+        total = (b[:, :, None, :, None] * left[:, None]).sum(3)
+        orders = ((0, 0, 0), (0, 1, 0), (0, 2, 0), (1, 0, 0), (2, 0, 0), (0, 0, 1))
+        return torch.stack([total[:, tx, rx, comb] for tx, rx, comb in orders], -1)
 
     def overlap(self, theta: Tensor, others: tuple[Tensor, Tensor, Tensor]) -> Tensor:
         """`correlate` of the wave theta `[5]` with other waves, given by their factors `[path, ...]`: `[path, 6]`."""
-        a, b, e = (weighted @ other.mT for weighted, other in zip(self._weighted(theta), others, strict=True))
+        weighted = self._weighted(theta[None])
+        a, b, e = (one[0] @ other.mT for one, other in zip(weighted, others, strict=True))
+        plain = b[0] * e[0]
         return torch.stack(
-            (
-                a[0] * b[0] * e[0],
-                a[1] * b[0] * e[0],
-                a[2] * b[0] * e[0],
-                a[0] * b[1] * e[0],
-                a[0] * b[2] * e[0],
-                a[0] * b[0] * e[1],
-            ),
-            -1,
+            (a[0] * plain, a[1] * plain, a[2] * plain, a[0] * b[1] * e[0], a[0] * b[2] * e[0], a[0] * b[0] * e[1]), -1
         )
 
     def information(self, theta: Tensor, gain: Tensor) -> Tensor:
@@ -109,16 +105,22 @@ class Aperture:
         return gram.real
 
     def _weighted(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        a, b, e = self.waves(theta)
-        return self.rx * a.conj(), self.tx * b.conj(), self.comb * e.conj()
+        """Conjugate factors of the waves theta `[path, 5]`, plain and times their points: `[path, 3 or 2, point]`."""
+        a, b, e = (factor.conj()[:, None] for factor in self.waves(theta))
+        return self.rx * a, self.tx * b, self.comb * e
 
-    def admissible(self, theta: Tensor) -> tuple[bool, bool]:
-        """Whether arrival and departure of theta `[5]` are directions ahead of the arrays and in view."""
-        sounding = self.sounding
-        return (
-            bool(_seen(sounding.array_rx, sounding.fov_rx, theta[0:2])),
-            bool(_seen(sounding.array_tx, sounding.fov_tx, theta[2:4])),
-        )
+    def moved(self, theta: Tensor, step: Tensor) -> Tensor:
+        """theta `[5]` plus as much of the step as leaves arrival and departure ahead of the arrays and in view.
+
+        A direction that leaves on one side comes back on the other where half-wavelength spacing makes both one.
+        """
+        there = theta + step
+        ends = ((self.sounding.array_rx, self.sounding.fov_rx), (self.sounding.array_tx, self.sounding.fov_tx))
+        for end, (array, fov) in enumerate(ends):
+            part = slice(2 * end, 2 * end + 2)
+            if array is not None and not bool(_seen(array, fov, there[part])):
+                there[part] = _in_view(array, fov, theta[part], step[part])
+        return there
 
     def strongest(self, x: Tensor) -> Tensor:
         """The theta `[5]` on a grid of two points per cell at which |<s, x>| is largest.
@@ -149,6 +151,19 @@ def device_direction(cosines: Tensor) -> Tensor:
     """Device-frame unit vectors `[..., 3]`, ahead of the array, of direction cosines y and z `[..., 2]`."""
     ahead = (1.0 - cosines.square().sum(-1, keepdim=True)).clamp_min(0.0).sqrt()
     return torch.cat((ahead, cosines), -1)
+
+
+def _in_view(array: PlanarArray, fov: float, here: Tensor, step: Tensor) -> Tensor:
+    """Direction cosines `[2]` in view: an alias of here + step, or else what of the step leads no further."""
+    there = here + step
+    period = torch.tensor([1.0 / array.horizontal, 1.0 / array.vertical], dtype=torch.float64)
+    alias = there - period * torch.round(there / period)
+    tries = torch.stack((torch.stack((alias[0], there[1])), torch.stack((there[0], alias[1])), alias))
+    share = torch.cat((0.5 ** torch.arange(1, 12, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)))
+    whole = torch.ones_like(share)
+    shorter = torch.stack((whole, share, share, whole, share, share), -1).reshape(-1, 2)
+    tries = torch.cat((tries, here + step * shorter, here[None]))
+    return tries[int(_seen(array, fov, tries).int().argmax())]
 
 
 def _seen(array: PlanarArray | None, fov: float, cosines: Tensor) -> Tensor:
@@ -183,9 +198,3 @@ def _points(array: PlanarArray | None) -> Tensor:
 def _wave(turns: Tensor) -> Tensor:
     """exp(j 2 pi turns), complex128."""
     return torch.polar(torch.ones_like(turns), 2 * math.pi * torch.remainder(turns, 1.0))
-
-
-def _orders(product: Tensor) -> Tensor:
-    """The plain correlation and those weighted along one axis, `[6]`, of `[tx 3, rx 3, tx_ant, comb 2]`."""
-    total = product.sum(2)
-    return torch.stack((total[0, 0, 0], total[0, 1, 0], total[0, 2, 0], total[1, 0, 0], total[2, 0, 0], total[0, 0, 1]))

@@ -1,10 +1,7 @@
 """SAGE: gain, delay, arrival and departure of the dominant paths out of a sounding.
 
-Space-alternating generalized expectation maximisation (Fessler and Hero 1994; Fleury et al. 1999). Paths are found one
-after the other, the strongest first, on coarse grids of what the paths before leave over. Then each path in turn is
-given everything that the others do not explain (expectation) and moved uphill in all its parameters (maximisation),
-until none moves by more than a hundredth of its deviation; a joint step of all paths after each sweep shortens the way
-where paths overlap. Everything in complex128; `apertures` has the waves.
+`sage_fit` is the algorithm, `apertures` has the waves; here the results become paths in the world, and what a sounding
+does not tell is said.
 """
 
 import math
@@ -23,13 +20,10 @@ from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.core.units import SPEED_OF_LIGHT, shortest_delay
 from rf3dgs.spectra.apertures import Aperture, device_direction
 from rf3dgs.spectra.crb import Bound, cramer_rao, told_by
+from rf3dgs.spectra.sage_fit import Fit
 
 MOST = 20  # paths per receiver unless told otherwise
-SWEEPS = 200
-MOVED = 0.01  # of its deviation: a path that moves less in a sweep has arrived
-EARLY = 2  # sweeps after each new path
-HALVINGS = 3
-DAMPING = (1e-9, 1e-3, 1e-1)  # of joint steps, the next where the one before explains less
+ZENITHS = ("aoa_zenith", "aod_zenith")
 Untold = Literal["refuse", "ahead"]
 
 
@@ -61,7 +55,7 @@ def sage(
     untold: Untold = "refuse",
     progress: Progress | None = None,
 ) -> Paths:
-    """The dominant paths `[*batch, path]` of a sounding, strongest first, in float64 and complex128; `kind` is None.
+    """The dominant paths `[*batch, path]` of a sounding, strongest first; `order` and `kind` are None.
 
     count: how many per receiver; None stops by itself where one more path explains less than its description costs
     (minimum description length), at the latest at `limit`. The noise power counts there; unknown, it is taken from the
@@ -91,9 +85,6 @@ def estimate_paths(
     return Estimate(paths, replace(bound, **zeniths), noise, residual, sweeps, converged)
 
 
-ZENITHS = ("aoa_zenith", "aod_zenith")
-
-
 def _estimated(
     sounding: Sounding, count: int | None, limit: int, untold: Untold, progress: Progress | None
 ) -> tuple[Paths, Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -102,10 +93,10 @@ def _estimated(
     rows, aperture = sounding.flat(), Aperture.of(sounding)
     known = rows.noise_power
     progress.start("SAGE", len(rows.rx))
-    found: list[_Fit] = []
+    found: list[Fit] = []
     for index, response in enumerate(rows.response):
         noise = float(known[index]) if isinstance(known, Tensor) else None
-        fit = _Fit(aperture, response, noise)
+        fit = Fit(aperture, response, noise)
         fit.search(limit if count is None else count, selective=count is None)
         fit.settle(selective=count is None)
         found.append(fit)
@@ -128,159 +119,7 @@ def _estimated(
     )
 
 
-class _Fit:
-    """The paths of one receiver while they are being found: theta `[path, 5]` and gain `[path]`."""
-
-    def __init__(self, aperture: Aperture, response: Tensor, noise: float | None) -> None:
-        self.aperture = aperture
-        self.response = response
-        self.known = noise
-        self.theta = torch.zeros(0, 5, dtype=torch.float64)
-        self.gain = torch.zeros(0, dtype=torch.complex128)
-        self.power = self.residual_power = float(response.abs().square().mean())
-        self.residual = response
-        varied = int(torch.isfinite(aperture.cell).sum())
-        self.penalty = 0.5 * (2 + varied) * math.log(2 * aperture.size)  # in units of the noise power
-        self.sweeps = 0
-        self.converged = True
-        self._waves = aperture.waves(self.theta)
-
-    @property
-    def noise(self) -> float:
-        """Noise power per entry: the known one, or that of the residual; never less than rounding leaves."""
-        return max(self.residual_power if self.known is None else self.known, 1e-26 * self.power)
-
-    def search(self, most: int, *, selective: bool) -> None:
-        """Add the strongest wave of the residual, one after the other, and let all settle a little each time."""
-        while len(self.gain) < most and self.residual_power > 1e-24 * self.power:
-            before = self.theta, self.gain, self.residual_power
-            fresh = self.aperture.strongest(self.residual)
-            self._set(torch.cat((self.theta, fresh[None])), torch.cat((self.gain, self.gain.new_zeros(1))))
-            for _ in range(4):
-                self._improve(len(self.gain) - 1)
-            self._weigh()
-            for _ in range(EARLY if len(self.gain) > 1 else 0):
-                self._sweep()
-                self._leap()
-            if selective and self.aperture.size * (before[2] - self.residual_power) < self.penalty * self.noise:
-                self._set(*before[:2])
-                self._weigh()
-                return
-
-    def settle(self, *, selective: bool) -> None:
-        """Sweep over all paths until none moves any more; then drop what explains less than it costs, and again."""
-        self._until_settled()
-        while selective and len(self.gain) > 1:
-            worth = self._worth()
-            least = int(worth.argmin())
-            if float(worth[least]) >= self.penalty * self.noise:
-                return
-            kept = torch.arange(len(self.gain)) != least
-            self._set(self.theta[kept], self.gain[kept])
-            self._until_settled()
-
-    def _until_settled(self) -> None:
-        self.converged, sweeps = not len(self.gain), 0
-        while not self.converged and sweeps < SWEEPS:
-            sweeps += 1
-            before = self.theta.clone()
-            self._sweep()
-            self._leap()
-            moved = ((self.theta - before) / self.aperture.cell).abs().amax(-1)
-            deviation = (3 * self.noise / (2 * math.pi**2 * self.aperture.size * self.gain.abs().square())).sqrt()
-            self.converged = bool((moved <= MOVED * deviation.clamp_min(1e-9)).all())
-        self.sweeps += sweeps
-
-    def _worth(self) -> Tensor:
-        """How much more power `[path]` would be left over, in all entries, without each path."""
-        a, b, e = self._waves
-        gram = (a.conj() @ a.mT) * (b.conj() @ b.mT) * (e.conj() @ e.mT)
-        inverse = torch.linalg.pinv(gram, hermitian=True)
-        return self.gain.abs().square() / inverse.diagonal().real.clamp_min(1e-300)
-
-    def _set(self, theta: Tensor, gain: Tensor) -> None:
-        self.theta, self.gain, self._waves = theta.clone(), gain.clone(), self.aperture.waves(theta)
-
-    def _weigh(self) -> None:
-        self.residual = self.response - self.aperture.model(self.theta, self.gain)
-        self.residual_power = float(self.residual.abs().square().mean())
-
-    def _sweep(self) -> None:
-        """Improve every path once, one after the other."""
-        for index in range(len(self.gain)):
-            self._improve(index)
-        self._weigh()
-
-    def _leap(self) -> None:
-        """One scoring step of all paths at once, kept only where it explains more.
-
-        Sweeps alone creep where paths overlap, because each path has to wait for the others.
-        """
-        aperture, theta, gain, left = self.aperture, self.theta, self.gain, self.residual_power
-        slopes = torch.stack([aperture.correlate(one, self.residual) for one in theta])
-        climb = 2 * math.pi * (gain.conj()[:, None] * slopes[:, 1:]).imag
-        gradient = torch.cat((torch.view_as_real(slopes[:, 0]), climb), 1).reshape(-1)
-        information = aperture.information(theta, gain)
-        scale = information.diagonal().clamp_min(1e-300).rsqrt()
-        free = torch.cat((torch.ones(2).bool(), torch.isfinite(aperture.cell))).repeat(len(gain))
-        scale = torch.where(free, scale, 0.0)
-        scaled = information * scale[:, None] * scale + torch.diag((~free).double())
-        for damping in DAMPING:
-            solved = torch.linalg.solve(scaled + damping * torch.eye(len(scaled)), gradient * scale) * scale
-            step = solved.reshape(-1, 7)
-            move = step[:, 2:].clamp(-0.5 * aperture.cell, 0.5 * aperture.cell)
-            there = torch.stack([self._kept_in_view(*pair) for pair in zip(theta, move, strict=True)])
-            self._set(there, gain + torch.view_as_complex(step[:, :2].contiguous()))
-            self._weigh()
-            if self.residual_power <= left:
-                return
-        self._set(theta, gain)
-        self._weigh()
-
-    def _improve(self, index: int) -> None:
-        """Move one path uphill on |<s, x>|^2, x what the others leave of the response; its gain is <s, x> / size.
-
-        A scoring step: gradient over expected curvature, exact but for the third order; halved while it leads down.
-        """
-        aperture, theta = self.aperture, self.theta[index]
-        gain = self.gain.clone()
-        gain[index] = 0.0
-
-        def correlation(at: Tensor) -> Tensor:
-            return aperture.correlate(at, self.response) - gain @ aperture.overlap(at, self._waves)
-
-        here = correlation(theta)
-        if float(here[0].abs()) > 0:
-            slope = 4 * math.pi * (here[1:] / here[0]).imag
-            step = torch.where(torch.isfinite(aperture.cell), slope / aperture.curvature, 0.0)
-            step = step.clamp(-0.5 * aperture.cell, 0.5 * aperture.cell)
-            for _ in range(HALVINGS):
-                there = self._kept_in_view(theta, step)
-                value = correlation(there)
-                if float(value[0].abs()) >= float(here[0].abs()):
-                    theta, here = there, value
-                    break
-                step = 0.5 * step
-        self.theta[index], self.gain[index] = theta, here[0] / aperture.size
-        for cache, wave in zip(self._waves, aperture.waves(theta), strict=True):
-            cache[index] = wave
-
-    def _kept_in_view(self, theta: Tensor, step: Tensor) -> Tensor:
-        """theta plus what of the step stays in view: both direction cosines of an end, or one of them, or none."""
-        there = theta + step
-        for end, fine in enumerate(self.aperture.admissible(there)):
-            if fine:
-                continue
-            y, z = 2 * end, 2 * end + 1
-            for kept in ((y,), (z,), (y, z)):
-                there[y], there[z] = theta[y] + step[y], theta[z] + step[z]
-                there[list(kept)] = theta[list(kept)]
-                if self.aperture.admissible(there)[end]:
-                    break
-        return there
-
-
-def _paths(found: list[_Fit], rows: Sounding) -> tuple[Paths, Tensor]:
+def _paths(found: list[Fit], rows: Sounding) -> tuple[Paths, Tensor]:
     """Paths `[rx, path]`, and where the zenith at receiver and transmitter is not told `[rx, path, 2]`."""
     most = max(len(fit.gain) for fit in found)
     columns: dict[str, list[Tensor]] = {}
@@ -293,7 +132,7 @@ def _paths(found: list[_Fit], rows: Sounding) -> tuple[Paths, Tensor]:
     return Paths(**stacked, frequency=rows.frequency, tx=rows.tx, rx=rows.rx), lost
 
 
-def _columns(fit: _Fit, rows: Sounding, index: int) -> dict[str, Tensor]:
+def _columns(fit: Fit, rows: Sounding, index: int) -> dict[str, Tensor]:
     """The columns `[path]` of one receiver's `Paths`, strongest first."""
     sounding, theta = fit.aperture.sounding, fit.theta.clone()
     lost = _lost(fit, sounding)
@@ -305,10 +144,11 @@ def _columns(fit: _Fit, rows: Sounding, index: int) -> dict[str, Tensor]:
         if array is not None:
             level = level * field_pattern(array.pattern, directions)
     distance = float((rows.rx.position[index] - rows.tx.position).double().norm())
-    centre = float(sounding.offsets.mean())
     delay, shift = _unwrapped(theta[:, 4], sounding, distance)
-    # The wave is centred on the comb and late by its measured delay; the gain sought is at the carrier.
-    turn = centre * (delay + shift) + rows.frequency * delay
+    # The gain is that of a wave centred on the comb. At the first frequency it does not change when the delay does by
+    # whole periods; from there it is taken to the carrier, and its phase off for the delay as stored, in float32.
+    first, centre = float(sounding.offsets[0]), float(sounding.offsets.mean())
+    turn = (centre - first) * theta[:, 4] + first * (delay + shift) + rows.frequency * delay.float().double()
     turn = torch.remainder(turn, 1.0)
     coeff = fit.gain / level * torch.polar(torch.ones_like(turn), 2 * math.pi * turn)
     aoa = angles_of(arrival @ rows.rx.world_from_device[index].double().mT)
@@ -324,7 +164,8 @@ def _columns(fit: _Fit, rows: Sounding, index: int) -> dict[str, Tensor]:
         "valid": torch.ones(len(delay), dtype=torch.bool),
         "lost": lost,
     }
-    return {name: value[order] for name, value in values.items()}
+    values = {name: value.float() if value.dtype == torch.float64 else value for name, value in values.items()}
+    return {name: value[order] for name, value in {**values, "coeff": coeff.to(torch.complex64)}.items()}
 
 
 def _unwrapped(delay: Tensor, sounding: Sounding, distance: float) -> tuple[Tensor, Tensor]:
@@ -344,7 +185,7 @@ def _unwrapped(delay: Tensor, sounding: Sounding, distance: float) -> tuple[Tens
     return earliest + torch.remainder(delay - earliest, period), torch.zeros_like(delay)
 
 
-def _lost(fit: _Fit, sounding: Sounding) -> Tensor:
+def _lost(fit: Fit, sounding: Sounding) -> Tensor:
     """True `[path, 2]` where the zenith at receiver or transmitter is no better known than the field of view tells.
 
     That is so with one row of elements, and where the deviation of a single path exceeds a uniform guess's.
@@ -361,6 +202,8 @@ def _lost(fit: _Fit, sounding: Sounding) -> Tensor:
 def _check(sounding: Sounding, count: int | None, limit: int, untold: Untold) -> None:
     if (count is not None and count < 1) or limit < 1:
         raise InputError(f"count and limit must be at least 1 path (count None: by itself); got {count} and {limit}")
+    if not sounding.response.shape[:-3].numel():
+        raise InputError("the sounding has no receivers; expected at least one")
     if untold not in ("refuse", "ahead"):
         raise InputError(f'untold must be "refuse" or "ahead"; got {untold!r}')
     ends = (("receiving", "arrival", sounding.array_rx), ("transmitting", "departure", sounding.array_tx))
