@@ -2,11 +2,9 @@
 
 import json
 import os
-import random
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import pytest
@@ -151,23 +149,21 @@ def trace_command(out, *options):
 
 
 @pytest.mark.slow
-def test_a_trace_killed_twenty_times_ends_with_the_bytes_of_a_calm_one(tracer, tmp_path):
-    what = ("--rx-count", 120, "--shard-size", 3, "--trace.rays", 30_000)
-    subprocess.run(trace_command(tmp_path / "calm", *what), check=True)
-    out, generator = tmp_path / "killed", random.Random(5)
-    for _ in range(20):
-        process = subprocess.Popen(trace_command(out, *what))
-        wait_for(
-            lambda pid=process.pid: (
-                (out / "lock.json").exists() and f'"pid": {pid},' in (out / "lock.json").read_text()
-            ),
-            60,
-        )
-        time.sleep(generator.uniform(0.0, 3.0))
-        process.send_signal(signal.SIGKILL)
-        assert process.wait() == -signal.SIGKILL, "the run ended before it was killed"
-    subprocess.run(trace_command(out, *what), check=True)
-    assert files_of(out) == files_of(tmp_path / "calm")
+@pytest.mark.parametrize(
+    "what",
+    [
+        ("trace", "box", "--rx-count", "120", "--shard-size", "2", "--trace.rays", "30000"),
+        ("photos", "box", "--count", "120", "--shard-size", "2", "--photo.width", "160", "--photo.height", "120"),
+    ],
+)
+def test_a_job_killed_twenty_times_ends_with_the_bytes_of_a_calm_one(tracer, tmp_path, what):
+    script = [sys.executable, "-m", "benchmarks.scale.kill_and_resume", str(tmp_path / "killed")]
+    options = ["--calm", str(tmp_path / "calm"), "--seconds", "1.0", "--", *what]
+    run = subprocess.run([*script, *options], stdout=subprocess.PIPE, text=True, check=False)
+    result = json.loads(run.stdout.splitlines()[-1])
+    assert result["differing"] == []
+    assert result["kills"] == 20
+    assert run.returncode == 0
 
 
 @pytest.mark.slow
