@@ -79,14 +79,30 @@ def test_a_moved_receiver_or_a_changed_scene_is_another_set(box, calm):
         run_job(job_of(box, scene=rough), calm)
 
 
-def test_a_receiver_with_too_few_paths_is_named_and_earlier_shards_are_kept(box, calm, tmp_path):
+def test_a_receiver_with_too_few_paths_gets_more_passes_and_the_others_stay_as_they_are(box, calm, tmp_path):
     with PathsReader(calm) as reader:
-        traced = reader.traced
-    assert traced is not None
-    first = int(traced.argmin())
-    with pytest.raises(InputError, match=rf"receiver {first} has {traced[first]:,} paths, but at least .* more rays"):
-        run_job(job_of(box, min_paths=int(traced.min()) + 1, shard_size=1), tmp_path)
-    assert len(list(tmp_path.glob("*.h5"))) == first
+        few = reader.traced
+        plain = list(reader)
+    assert few is not None
+    wanted = int(few.min()) + 1
+    run_job(job_of(box, min_paths=wanted), tmp_path)
+    with PathsReader(tmp_path) as reader:
+        enough = reader.traced
+        rows = list(reader)
+    assert enough is not None
+    assert enough.min() >= wanted
+    for before, after, row, other in zip(few, enough, rows, plain, strict=True):
+        if before >= wanted:
+            assert after == before
+            assert torch.equal(row.coeff, other.coeff)
+        else:
+            assert after == pytest.approx(2 * before, rel=0.05)  # twice the passes, counting noise below 3 % (3 sigma)
+            assert float(row.path_gain.sum()) == pytest.approx(float(other.path_gain.sum()), rel=0.1)
+
+
+def test_a_receiver_that_more_passes_do_not_help_is_named(box, tmp_path):
+    with pytest.raises(InputError, match=r"receiver 0 has [\d,]+ paths after 16 passes of 3,000 rays, but at least"):
+        run_job(job_of(box, min_paths=10**9), tmp_path)
 
 
 def test_a_receiver_in_the_wrong_place_is_named_by_its_own_number(box, tmp_path):

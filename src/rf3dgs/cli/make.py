@@ -31,7 +31,7 @@ class Trace:
     out: Path = Path("lobby.paths")
     """The folder to write: a manifest and shards in HDF5; the same command again makes what is missing."""
     preset: Literal["paper"] | None = None
-    """"paper": 800 receivers, depth 3, at least 300,000 paths each; instead of --trace.*"""
+    """"paper": 800 receivers, depth 3, 300,000 rays and, with passes, as many paths at least; instead of --trace.*"""
     trace: TraceConfig = field(default_factory=TraceConfig)
     """How paths are traced."""
     shard_size: int = 25
