@@ -222,7 +222,7 @@ def main() -> None:
     parser.add_argument("--positions", type=int, default=8)
     parser.add_argument("--binning", type=int, default=4, help="positions whose paths are kept whole for comparison")
     parser.add_argument("--rays", type=int, default=300_000, help="of the first solve")
-    parser.add_argument("--rx-seed", type=int, default=0)
+    parser.add_argument("--rx.seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     parser.add_argument("--read", type=Path, help="take the figures of this file instead of measuring")
     parser.add_argument("--page", type=Path, help="put the tables into this page")

@@ -36,6 +36,7 @@ class FakeTask:
     dies_once: str = ""  # a marker file: the process that makes this shard first is killed
     dies: bool = False
     fault: str = ""
+    alone: str = ""  # a marker file that exists while a shard is made: two at a time fail
     two_kinds: str = ""  # a marker file: the process that answers first has another version than the rest
 
     def made_by(self):
@@ -52,11 +53,15 @@ class FakeTask:
             raise DataError("receiver 7 is inside the sofa")
         if self.fault == "theirs":
             raise ZeroDivisionError("by zero")
+        if self.alone and not first_time(self.alone):
+            raise DataError("two tasks at a time in one process")
         files = {}
         for item in self.numbers:
             time.sleep(self.seconds)
             files[f"{item}.bin"] = content(item, self.size)
             each()
+        if self.alone:
+            Path(self.alone).unlink()
         return files
 
 

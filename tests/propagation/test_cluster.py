@@ -11,6 +11,7 @@ import pytest
 from tests.propagation.fake_work import FakeJob, command, files_of, wait_for
 
 from rf3dgs.core.errors import DataError, InputError, MissingDependencyError, RfError
+from rf3dgs.core.progress import Silent
 from rf3dgs.propagation import cluster
 from rf3dgs.propagation.jobs import Here, run_job
 
@@ -107,6 +108,18 @@ def test_an_existing_scheduler_is_used_and_left_running(crew, tmp_path):
     assert crew._client.submit(sum, [1, 2]).result() == 3
 
 
+def test_a_worker_with_many_threads_makes_one_shard_at_a_time(tmp_path):
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=4, host="127.0.0.1", dashboard_address="127.0.0.1:0"
+        ) as threads,
+        distributed.Client(threads) as client,
+    ):
+        job = FakeJob(20, 2, seconds=0.02, common={"alone": str(tmp_path / "alone")})
+        make(job, tmp_path / "set", cluster.DaskCrew(client))
+    assert len(files_of(tmp_path / "set")) == 21
+
+
 def test_a_scheduler_that_is_not_there_is_one_sentence(monkeypatch, tmp_path):
     monkeypatch.setattr(cluster, "PATIENCE", 1.0)
     with pytest.raises(InputError, match=r"no dask scheduler answers at tcp://127.0.0.1:9 .*; start one"):
@@ -123,6 +136,32 @@ def test_a_scheduler_without_workers_is_given_up_after_a_while(crew, tmp_path):
         pytest.raises(RfError, match=r"scheduler tcp://127.0.0.1:\d+ has had no workers for 0.5 seconds; start some"),
     ):
         make(FakeJob(), tmp_path, cluster.DaskCrew(client, patience=0.5))
+
+
+def test_a_scheduler_that_goes_away_is_one_sentence_and_finished_shards_are_kept(tmp_path):
+    script = (
+        "import distributed, time\n"
+        "if __name__ == '__main__':\n"
+        "    it = distributed.LocalCluster(n_workers=1, host='127.0.0.1', dashboard_address='127.0.0.1:0')\n"
+        "    print(it.scheduler_address, flush=True)\n"
+        "    time.sleep(60)\n"
+    )
+    (tmp_path / "scheduler.py").write_text(script)
+    started = [sys.executable, str(tmp_path / "scheduler.py")]
+    process = subprocess.Popen(started, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": "."})
+    assert process.stdout is not None
+    address = process.stdout.readline().strip()
+
+    class KillingProgress(Silent):
+        def update(self, done, note=""):
+            process.kill()
+
+    crew = cluster.existing_cluster(address)
+    with dask.config.set({"distributed.comm.timeouts.connect": "1s"}), process.stdout:
+        with pytest.raises(RfError, match=r"the scheduler .* is gone; finished shards are kept: run the same command"):
+            run_job(FakeJob(20, 2, seconds=0.5), tmp_path / "set", crew=crew, progress=KillingProgress())
+        process.wait()
+    assert (tmp_path / "set" / "0.bin").exists()
 
 
 def test_workers_without_dask_are_a_missing_dependency(monkeypatch, tmp_path):

@@ -28,7 +28,7 @@ class Trace:
     """The folder to write: a manifest and shards in HDF5; the same command again makes what is missing."""
     preset: Preset | None = None
     """Frequency, scattering and what rays do, by name; the scene's own without. "paper" is "diffuse" for 800 receivers
-    with at least 300,000 paths each."""
+    with, by as many passes as it takes, at least 300,000 paths each."""
     rx: ReceiverConfig = field(default_factory=ReceiverConfig)
     """Where receivers stand."""
     trace: TraceConfig = field(default_factory=TraceConfig)

@@ -9,6 +9,8 @@ from rf3dgs.core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from rf3dgs.propagation import sionna as sionna
+    from rf3dgs.propagation.cluster import existing_cluster as existing_cluster
+    from rf3dgs.propagation.cluster import local_processes as local_processes
     from rf3dgs.propagation.config import PhotoConfig as PhotoConfig
     from rf3dgs.propagation.config import ReceiverConfig as ReceiverConfig
     from rf3dgs.propagation.config import TraceConfig as TraceConfig
@@ -16,11 +18,13 @@ if TYPE_CHECKING:
     from rf3dgs.propagation.deepmimo import deepmimo_pairs as deepmimo_pairs
     from rf3dgs.propagation.deepmimo import read_deepmimo as read_deepmimo
     from rf3dgs.propagation.deepmimo_write import write_deepmimo as write_deepmimo
+    from rf3dgs.propagation.jobs import run_job as run_job
     from rf3dgs.propagation.llvm import find_llvm as find_llvm
     from rf3dgs.propagation.matlab import write_mat as write_mat
     from rf3dgs.propagation.matlab import write_matlab as write_matlab
     from rf3dgs.propagation.measured import read_sounding as read_sounding
     from rf3dgs.propagation.measured import write_sounding as write_sounding
+    from rf3dgs.propagation.photo_job import PhotoJob as PhotoJob
     from rf3dgs.propagation.photographer import render_panorama as render_panorama
     from rf3dgs.propagation.photographer import render_panoramas as render_panoramas
     from rf3dgs.propagation.photographer import render_photos as render_photos
@@ -36,6 +40,7 @@ if TYPE_CHECKING:
     from rf3dgs.propagation.scenes import scene_of as scene_of
     from rf3dgs.propagation.sounder import Sounder as Sounder
     from rf3dgs.propagation.sounder import sound as sound
+    from rf3dgs.propagation.trace_job import TraceJob as TraceJob
     from rf3dgs.propagation.walks import camera_tour as camera_tour
 
 _HOMES = {
@@ -67,6 +72,11 @@ _HOMES = {
     "write_sounding": ".measured",
     "render_panorama": ".photographer",
     "render_panoramas": ".photographer",
+    "run_job": ".jobs",
+    "TraceJob": ".trace_job",
+    "PhotoJob": ".photo_job",
+    "local_processes": ".cluster",
+    "existing_cluster": ".cluster",
     "find_llvm": ".llvm",
 }
 __all__ = [  # noqa: RUF022 (reading order)
@@ -98,6 +108,11 @@ __all__ = [  # noqa: RUF022 (reading order)
     "write_sounding",
     "render_panorama",
     "render_panoramas",
+    "run_job",
+    "TraceJob",
+    "PhotoJob",
+    "local_processes",
+    "existing_cluster",
     "find_llvm",
 ]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

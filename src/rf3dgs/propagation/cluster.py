@@ -8,6 +8,7 @@ Every worker must have the versions and the processor type of the others; one th
 import json
 import logging
 import tempfile
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -26,6 +27,9 @@ PATIENCE = 60.0
 """Seconds without any worker, or without an answer of the scheduler, after which the run gives up."""
 AHEAD = 2
 """Shards per worker that are handed out at a time: few results wait in memory."""
+
+_ALONE = threading.Lock()
+"""Held by the task at work: the tracer is not made for two threads, and a foreign worker may have more than one."""
 
 
 class Refusal(NamedTuple):
@@ -70,7 +74,9 @@ class DaskCrew:
         pending: dict[Future, tuple[int, Task, int]] = {}
 
         def hand_out(shard: int, task: Task, tries: int) -> None:
-            pending[self._client.submit(_work, task, dict(made_by), pure=False)] = shard, task, tries
+            with self._there():
+                future = self._client.submit(_work, task, dict(made_by), pure=False)
+            pending[future] = shard, task, tries
 
         try:
             while True:
@@ -83,6 +89,7 @@ class DaskCrew:
                     try:
                         result = future.result()
                     except Exception as error:  # a task may fail in any way
+                        self._check_scheduler()
                         _give_up(shard, error, tries)
                         hand_out(shard, task, tries + 1)
                         continue
@@ -92,7 +99,8 @@ class DaskCrew:
                         raise _stranger(result.worker, result.difference, "than the others")
                     yield shard, result
         finally:
-            self._client.cancel(list(pending))
+            with suppress(OSError, TimeoutError):
+                self._client.cancel(list(pending))
 
     def _workers(self) -> list[str]:
         try:
@@ -106,7 +114,25 @@ class DaskCrew:
 
     def _threads(self) -> dict[str, int]:
         """The workers that are there now, and their threads."""
-        return dict(self._client.nthreads())  # type: ignore[arg-type]
+        with self._there():
+            return dict(self._client.nthreads())  # type: ignore[arg-type]
+
+    def _check_scheduler(self) -> None:
+        if self._client.status not in ("running", "connecting"):
+            raise self._gone()
+
+    @contextmanager
+    def _there(self) -> Iterator[None]:
+        """Turn a scheduler that is no longer there into one sentence."""
+        from distributed import CancelledError
+
+        try:
+            yield
+        except (OSError, CancelledError) as error:
+            raise self._gone() from error
+
+    def _gone(self) -> RfError:
+        return RfError(f"the scheduler {self._address} is gone; finished shards are kept: run the same command again")
 
     def _done(self, futures: "list[Future]") -> "list[Future]":
         """Those that ended, at least one; RfError when nobody has been there to work on them for a while."""
@@ -114,13 +140,12 @@ class DaskCrew:
 
         alone_since = None
         while True:
-            with suppress(TimeoutError):
+            with self._there(), suppress(TimeoutError):
                 wait(futures, timeout=1.0, return_when="FIRST_COMPLETED")
-            lost = [future for future in futures if future.status in ("cancelled", "lost")]
-            if lost or self._client.status not in ("running", "connecting"):
-                raise RfError(
-                    f"the scheduler {self._address} is gone; finished shards are kept: run the same command again"
-                )
+            self._check_scheduler()
+            # A future is "lost" for a moment when the worker that kept its result dies; dask makes it again.
+            if any(future.cancelled() for future in futures):
+                raise self._gone()
             ended = [future for future in futures if future.done()]
             if ended:
                 return ended
@@ -206,6 +231,7 @@ def _need_distributed() -> None:
 
 
 def _made_by(task: Task) -> dict:
+    """What a worker answers, as it comes back from JSON."""
     return json.loads(json.dumps(dict(task.made_by())))
 
 
@@ -213,8 +239,9 @@ def _work(task: Task, made_by: dict) -> Mapping[str, bytes] | Refusal:
     """On the worker: the files of the shard, unless this worker, which may have come late, is not like the others."""
     from distributed import get_worker
 
-    found = difference(made_by, _made_by(task))
-    return Refusal(get_worker().address, found) if found else task.make(lambda: None)
+    with _ALONE:
+        found = difference(made_by, _made_by(task))
+        return Refusal(get_worker().address, found) if found else task.make(lambda: None)
 
 
 def _stranger(worker: str, found: str, than: str) -> InputError:

@@ -3,7 +3,7 @@
 import math
 import secrets
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from io import BytesIO
 
@@ -20,6 +20,9 @@ from rf3dgs.propagation.toolchain import fingerprint, made_by, scene_of_run
 
 SHARD_SIZE = 25
 """Receivers in a shard unless said otherwise: half a minute of work, and some hundred megabytes."""
+
+MOST_PASSES = 16
+"""A receiver with too few paths is traced again with 2, 4, 8 and at last this many times the passes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +57,17 @@ class TraceTask:
             traced = trace_each(
                 scene, self.tx, self.rx, config, frequency=self.frequency, indices=self.numbers, tracer=tracer
             )
-            for number, paths in zip(self.numbers, traced, strict=True):
+            for place, (number, paths) in enumerate(zip(self.numbers, traced, strict=True)):
+                passes = config.passes
+                while paths.count < self.min_paths and passes < MOST_PASSES * config.passes:
+                    passes *= 2
+                    rx, finer = self.rx[place : place + 1], replace(config, passes=passes)
+                    paths = tracer.paths(self.tx, rx, finer, config.seed + number)
                 count = int(paths.count)
                 if count < self.min_paths:
                     raise InputError(
-                        f"receiver {number} has {count:,} paths, but at least {self.min_paths:,} are asked for; trace "
-                        "with more rays"
+                        f"receiver {number} has {count:,} paths after {passes} passes of {config.rays:,} rays, but at "
+                        f"least {self.min_paths:,} are asked for; trace with more rays"
                     )
                 writer.append(bin_diffuse(paths, cell=cell, delay_step=config.delay_step), traced=count)
                 each()
@@ -71,7 +79,8 @@ class TraceJob:
     """The paths from `tx` to the poses `rx` `[rx]`, in the folder that `PathsReader` reads.
 
     scene: a name or XML file that every worker can open, or a `Scene`, which is sent to them. rule: how the poses were
-    chosen, for the manifest. min_paths: refuse a receiver with fewer paths, before diffuse ones are merged.
+    chosen, for the manifest. min_paths: a receiver with fewer paths, before diffuse ones are merged, is traced
+    again with twice the passes, up to `MOST_PASSES` times as many, then refused.
     """
 
     scene: str | Scene
