@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Protocol
 
 from rf3dgs.core import manifest as manifests
-from rf3dgs.core.errors import DataError, InputError
+from rf3dgs.core.errors import DataError, InputError, RfError
 from rf3dgs.core.files import remove_partials, write_whole
 from rf3dgs.core.lock import LOCK, locked
 from rf3dgs.core.manifest import Manifest, difference, load_manifest
@@ -117,7 +117,12 @@ def run_job(
                 plan.save(folder)
             else:
                 _refuse_another(folder, old, plan)
-            _make(job, folder, missing, workers, made_by, progress)
+            try:
+                _make(job, folder, missing, workers, made_by, progress)
+            except RfError:
+                if not any(_finished(folder, job, shard) for shard in range(plan.shards)):
+                    (folder / manifests.NAME).unlink()  # what was asked for cannot be made: nothing was begun
+                raise
         return plan
 
 
