@@ -86,8 +86,8 @@ struct AdamRow {
 // their squares are added to `square`.
 template <int L>
 RF_INLINE Vec shrinking(const float* value, int floats, float shrink, Vec& square) {
-  alignas(64) float bands[kLanes] = {};
-  std::memcpy(bands, value, floats * sizeof(float));
+  alignas(64) float bands[kLanes];
+  store(bands, load_first(value, floats));
   for (int at = 0; at < floats; at += L) bands[at] = 0.0f;
   const Vec above = load(bands);
   square += above * above;
