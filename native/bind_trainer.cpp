@@ -106,6 +106,7 @@ class BoundTrainer {
     logits_ = floats_of(arrays_, "logit_opacities", count);
     p.scales = floats_of(arrays_, "scales", 3 * count);
     p.opacities = floats_of(arrays_, "opacities", count);
+    p.bounds = floats_of(arrays_, "bounds", kBoundColumns * bound_groups(count));
     p.sh = sh.data();
     for (const char* name : {"means", "quats", "log_scales", "logit_opacities", "scales", "opacities"}) {
       require(arrays_.contains(name), "the trainer misses an array");
@@ -129,6 +130,9 @@ class BoundTrainer {
   void activate() {
     kernels().training.exponentials(log_scales_, 3 * population_.count, population_.scales);
     kernels().training.sigmoids(logits_, population_.count, population_.opacities);
+    if (population_.bounds == nullptr) return;
+    kernels().bound(population_.means, population_.scales, population_.count, 0, bound_groups(population_.count),
+                    population_.bounds);
   }
 
   void draw(In<4, 4> viewmat, std::optional<In<3, 3>> camera, int width, int height, int bases,
@@ -143,7 +147,7 @@ class BoundTrainer {
             "outputs do not fit the drawing");
     nb::gil_scoped_release released;
     trainer_.draw(population_, wishes_->drawing, threads, picture.data(), weight.data());
-    for (size_t at = 0; at < population_.count; ++at) radii.data()[population_.order[at]] = trainer_.radii()[at];
+    trainer_.copy_radii(population_, threads, radii.data());
   }
 
   double update(In<-1, -1, -1> picture_gradient, std::optional<In<-1, -1>> weight_gradient, float means, float quats,
@@ -242,6 +246,7 @@ void draw_plain(In<-1, 3> means, In<-1, 4> quats, In<-1, 3> log_scales, In<-1> l
 }  // namespace
 
 void bind_trainer(nb::module_& m) {
+  m.def("bounds_shape", [](size_t gaussians) { return nb::make_tuple(kBoundColumns, bound_groups(gaussians)); });
   m.def("morton_order", &order_of, "means"_a.noconvert(), "order"_a.noconvert());
   m.def("draw", &draw_plain);
   nb::class_<BoundTrainer>(m, "Trainer", "Gaussians with moments, drawn and moved in one call.")

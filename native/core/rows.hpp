@@ -147,4 +147,23 @@ RF_INLINE void store_columns_to(const Vec* columns, float* to, int lanes) {
   store_columns<N>(columns, rows, lanes);
 }
 
+// Sixteen rows side by side, or those whose indices are given.
+struct Neighbours {
+  size_t start;
+  int lanes;
+  template <int N>
+  RF_INLINE void columns(const float* from, Vec* out) const {
+    load_columns_from<N>(from + N * start, lanes, out);
+  }
+};
+
+struct Chosen {
+  const uint32_t* sources;
+  int lanes;
+  template <int N>
+  RF_INLINE void columns(const float* from, Vec* out) const {
+    load_columns_at<N>(from, sources, lanes, out);
+  }
+};
+
 }  // namespace

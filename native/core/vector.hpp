@@ -52,12 +52,29 @@ RF_INLINE Vec reciprocal(Vec x) {
 RF_INLINE Vec reciprocal(const Vec& x) { return 1.0f / x; }
 #endif
 
+// 1 / sqrt(x) for x that is not below the least normal float; the least there is for an infinite x.
 #if defined(__AVX512F__)
-RF_INLINE __m256 halves_added(Vec value) {
+RF_INLINE Vec inverse_sqrt(Vec x) {
+  const Vec bounded = min_vec(x, splat_vec(3.4e38f)), guess = (Vec)_mm512_rsqrt14_ps((__m512)bounded);
+  return mul_add(guess * 0.5f, mul_from(bounded * guess, guess, splat_vec(1.0f)), guess);
+}
+#else
+RF_INLINE Vec inverse_sqrt(const Vec& x) { return 1.0f / sqrt_vec(x); }
+#endif
+
+// A vector on its way to the sum of its lanes: where it helps, its halves are added already.
+#if defined(__AVX2__)
+typedef __m256 Half;
+#if defined(__AVX512F__)
+RF_INLINE Half halves_added(Vec value) {
   return _mm512_castps512_ps256((__m512)value) + _mm512_extractf32x8_ps((__m512)value, 1);
 }
-#elif defined(__AVX2__)
-RF_INLINE __m256 halves_added(const Vec& value) { return (__m256)(value.part[0] + value.part[1]); }
+#else
+RF_INLINE Half halves_added(const Vec& value) { return (__m256)(value.part[0] + value.part[1]); }
+#endif
+#else
+typedef Vec Half;
+RF_INLINE Half halves_added(const Vec& value) { return value; }
 #endif
 
 // The sum of all lanes, always added in the same order.
@@ -84,10 +101,9 @@ RF_INLINE float largest_of(const Vec& value) {
 }
 
 // The sums of all lanes of each of four vectors.
-RF_INLINE void four_sums(const Vec* value, float* out) {
+RF_INLINE void four_sums(const Half* value, float* out) {
 #if defined(__AVX2__)
-  const __m256 a = halves_added(value[0]), b = halves_added(value[1]);
-  const __m256 c = halves_added(value[2]), d = halves_added(value[3]);
+  const __m256 a = value[0], b = value[1], c = value[2], d = value[3];
   const __m256 ab = _mm256_unpacklo_ps(a, b) + _mm256_unpackhi_ps(a, b);
   const __m256 cd = _mm256_unpacklo_ps(c, d) + _mm256_unpackhi_ps(c, d);
   const __m256 sums = _mm256_shuffle_ps(ab, cd, 0x44) + _mm256_shuffle_ps(ab, cd, 0xee);
@@ -101,7 +117,11 @@ RF_INLINE void four_sums(const Vec* value, float* out) {
 template <int N>
 RF_INLINE void sums_of(const Vec* value, float* out) {
   static_assert(N % 4 == 0);
-  for (int at = 0; at < N; at += 4) four_sums(value + at, out + at);
+  for (int at = 0; at < N; at += 4) {
+    const Half halves[4] = {halves_added(value[at]), halves_added(value[at + 1]), halves_added(value[at + 2]),
+                            halves_added(value[at + 3])};
+    four_sums(halves, out + at);
+  }
 }
 
 RF_INLINE IntVec to_int(const Vec& value) {  // towards zero

@@ -195,6 +195,36 @@ RF_INLINE Vec load_some(const float* from, int lanes) {
   return load(of);
 }
 
+// The first `count` floats, zeros behind them; and only these written.
+RF_INLINE Vec load_first(const float* from, int count) {
+  if (count == kLanes) return load(from);
+#if defined(__AVX512F__)
+  return (Vec)_mm512_maskz_loadu_ps(static_cast<__mmask16>((1u << count) - 1u), from);
+#else
+  alignas(64) float of[kLanes] = {};
+  for (int lane = 0; lane < count; ++lane) of[lane] = from[lane];
+  return load(of);
+#endif
+}
+RF_INLINE void store_first(float* to, const Vec& value, int count) {
+  if (count == kLanes) return store(to, value);
+#if defined(__AVX512F__)
+  _mm512_mask_storeu_ps(to, static_cast<__mmask16>((1u << count) - 1u), (__m512)value);
+#else
+  alignas(64) float of[kLanes];
+  store(of, value);
+  for (int lane = 0; lane < count; ++lane) to[lane] = of[lane];
+#endif
+}
+
+#if defined(__AVX512F__)
+// Sixteen of the thirty-two floats of `low` and `high`, from the `by`-th on.
+template <int by>
+RF_INLINE Vec shifted(Vec low, Vec high) {
+  return (Vec)_mm512_alignr_epi32((__m512i)high, (__m512i)low, by);
+}
+#endif
+
 // Of floats that are not negative, whose bits order as they do; the units that compare integers are less in demand.
 RF_INLINE Vec min_of_positive(const Vec& a, const Vec& b) {
 #if defined(__AVX512F__)

@@ -1,17 +1,15 @@
-// Lists for every tile the splats that reach it.
+// Lists for every tile the splats that reach it, from front to back.
 #pragma once
 
 #include "splats/scene.hpp"
 
 namespace rf3dgs {
 
-// Finds the tiles that the splats of a chunk reach and counts them in the chunk's row of `tile_counts`.
+// Finds the tiles that the splats of a chunk reach.
 void find_tiles(Scene& scene, int chunk);
 
-// Once all chunks have been found: the lists of all tiles, not yet in order.
+// Once all chunks have been found: the lists of all tiles, ordered by depth, equal depths by the order of the
+// Gaussians.
 void list_tiles(Scene& scene, int threads);
-
-// Brings a tile's list into `entries`, ordered by depth, equal depths by the order of the Gaussians.
-void sort_by_depth(Scene& scene, int tile);
 
 }  // namespace rf3dgs

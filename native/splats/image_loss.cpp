@@ -3,17 +3,15 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
-#include <memory>
 #include <vector>
 
+#include "core/buffer.hpp"
 #include "core/thread_pool.hpp"
 #include "splats/constants.hpp"
 #include "splats/kernels.hpp"
 
 namespace rf3dgs {
 namespace {
-
-constexpr int kRows = 4;  // of one task
 
 struct Window {
   float tap[kSsimTaps];
@@ -30,13 +28,13 @@ Window ssim_window() {
   return window;
 }
 
-// Calls work(row, scratch) for all rows.
-template <class RowWork>
-void each_row(const PicturePair& pair, int threads, const RowWork& work) {
-  const size_t scratch_size = 6 * static_cast<size_t>(loss_line(pair.width, pair.channels));
-  parallel_for((pair.height + kRows - 1) / kRows, threads, [&](int task) {
-    const std::unique_ptr<float[]> scratch(new float[scratch_size]);
-    for (int row = task * kRows; row < std::min(pair.height, (task + 1) * kRows); ++row) work(row, scratch.get());
+// Calls work(first, rows, scratch) for all bands of rows.
+template <class BandWork>
+void each_band(const PicturePair& pair, int threads, const BandWork& work) {
+  parallel_for((pair.height + kLossRows - 1) / kLossRows, threads, [&](int band) {
+    thread_local Buffer<float> scratch;
+    const int first = band * kLossRows;
+    work(first, std::min(kLossRows, pair.height - first), scratch.resize(loss_scratch(pair.width, pair.channels)));
   });
 }
 
@@ -81,10 +79,10 @@ double l1_ssim(const float* picture, const LossTarget& target, float ssim_weight
   float* const partial = memory.partial.data();
 
   std::vector<LossSums> sums(pair.height);
-  each_row(pair, threads, [&](int row, float* scratch) {
-    float* const line = partial + row * stride;
-    float* const out[3] = {line, line + plane, line + 2 * plane};
-    sums[row] = with_ssim ? kernel.ssim_row(pair, row, out, scratch) : kernel.l1_row(pair, row, out, scratch);
+  const auto sum_rows = with_ssim ? kernel.ssim_rows : kernel.l1_rows;
+  float* const out[3] = {partial, partial + plane, partial + 2 * plane};
+  each_band(pair, threads, [&](int first, int rows, float* scratch) {
+    sum_rows(pair, first, rows, out, sums.data(), scratch);
   });
 
   double total_weight = static_cast<double>(pair.height) * pair.width;
@@ -102,9 +100,9 @@ double l1_ssim(const float* picture, const LossTarget& target, float ssim_weight
     const float* const in[3] = {partial, partial + plane, partial + 2 * plane};
     const float l1_scale = static_cast<float>((1.0 - ssim_weight) * scale);
     const float ssim_scale = static_cast<float>(-ssim_weight * scale);
-    const auto gradient_row = with_ssim ? kernel.ssim_gradient_row : kernel.l1_gradient_row;
-    each_row(pair, threads, [&](int row, float* scratch) {
-      gradient_row(pair, row, in, l1_scale, ssim_scale, gradient, scratch);
+    const auto gradient_rows = with_ssim ? kernel.ssim_gradient_rows : kernel.l1_gradient_rows;
+    each_band(pair, threads, [&](int first, int rows, float* scratch) {
+      gradient_rows(pair, first, rows, in, l1_scale, ssim_scale, gradient, scratch);
     });
   }
   return (1.0 - ssim_weight) * l1 * scale + ssim_weight * (1.0 - ssim * scale);
@@ -112,9 +110,8 @@ double l1_ssim(const float* picture, const LossTarget& target, float ssim_weight
 
 void target_statistics(const LossTarget& target, int threads, float* mean, float* square) {
   const PicturePair pair = pair_of(target.picture, target);
-  const size_t stride = loss_stride(pair.width, pair.channels);
-  each_row(pair, threads, [&](int row, float* scratch) {
-    kernels().target_row(pair, row, mean + row * stride, square + row * stride, scratch);
+  each_band(pair, threads, [&](int first, int rows, float* scratch) {
+    kernels().target_rows(pair, first, rows, mean, square, scratch);
   });
 }
 

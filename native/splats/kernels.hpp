@@ -44,7 +44,14 @@ struct Geometry {
   const float* scales;
   const float* opacities;
   const float* offset;  // [gaussian, 2] added to the projected centres [pixel]; may be null
+  const float* bounds = nullptr;  // of groups, see below; or null
 };
+
+// Where sixteen neighbours are: five columns [bound_groups] of the x, y, z and radius of a ball around their means and
+// of their largest scale [m]. Made once while the geometry rests, they tell which Gaussians a view cannot show before
+// these are read.
+constexpr int kBoundGroup = 16, kBoundColumns = 5;
+constexpr size_t bound_groups(size_t gaussians) { return (gaussians + 255) / 256 * 16; }
 
 // The pixels a splat may reach: from left to right and top to bottom; none where right < left. On the sphere columns
 // count round and round.
@@ -70,7 +77,6 @@ struct Found {
 // A splat in a tile's list. Entries are numbered (`slot`) splat by splat, and within a splat tile by tile, which is where
 // their gradients go.
 struct Entry {
-  float depth;
   uint32_t splat, slot, blocks;
 };
 
@@ -122,8 +128,8 @@ constexpr int gradient_row(int chunk, int geometry_sums) { return (chunk + 1 + g
 struct ShapeKernels {
   int splat_floats;   // size of a splat
   int geometry_sums;  // that backward blending adds up for a splat
-  // Projects Gaussians [begin, end) and returns how many are visible.
-  size_t (*project)(const View&, const Geometry&, size_t begin, size_t end, const Projected&);
+  // Projects Gaussians [begin, end) of all and returns how many are visible; begin is a multiple of 256.
+  size_t (*project)(const View&, const Geometry&, size_t gaussians, size_t begin, size_t end, const Projected&);
   // From the geometry sums [count, geometry_sums] of splats to rows of gradients.
   void (*project_backward)(const View&, const Geometry&, const uint32_t* sources, const float* sums, size_t count,
                            const GeometryRows&);
@@ -157,31 +163,39 @@ struct LossSums {
   float ssim, l1;
 };
 
-// Floats of a row in whole vectors, and of a row with the window's reach on both sides.
+// Floats of a row in whole vectors.
 constexpr int loss_stride(int width, int channels) { return (width * channels + 15) / 16 * 16; }
-constexpr int loss_line(int width, int channels) {
-  return loss_stride(width, channels) + 2 * kSsimRadius * channels + 16;
+// The loss takes this many rows at a time. Its scratch memory holds so many lines of five maps, each padded by the
+// window's reach in whole vectors, and two lines more.
+constexpr int kLossRows = 8;
+constexpr int kLossMaps = 5;
+constexpr int loss_pad(int channels) { return (kSsimRadius * channels + 15) / 16 * 16; }
+constexpr size_t loss_scratch(int width, int channels) {
+  const size_t line = loss_stride(width, channels) + 2 * loss_pad(channels);
+  return (kLossMaps * kLossRows + 2) * line;
 }
 
 struct Kernels {
   const char* name;
   ShapeKernels shape[kKinds];
+  // The bounds of groups [begin, end); all [kBoundColumns, bound_groups] have to be written.
+  void (*bound)(const float* means, const float* scales, size_t gaussians, size_t begin, size_t end, float* bounds);
   void (*harmonics)(const float* sh, const float* directions, int bases, int channels, size_t begin, size_t end,
                     float* out);
   void (*harmonics_backward)(const float* gradient, const float* directions, int bases, int channels, size_t begin,
                              size_t end, float* out);
-  // Picture similarity, a row at a time; `scratch` holds six lines of `loss_line` floats. First sum weight * SSIM and
-  // weight * L1 and write the row's partial derivatives with respect to the blurred a, aa and ab (`loss_stride` floats
-  // each); once all rows are there, blur these both ways into the gradient.
-  LossSums (*ssim_row)(const PicturePair&, int row, float* const partial[3], float* scratch);
-  void (*ssim_gradient_row)(const PicturePair&, int row, const float* const partial[3], float l1_scale,
-                            float ssim_scale, float* gradient, float* scratch);
+  // Picture similarity, up to `kLossRows` rows from `first` on; `scratch` holds `loss_scratch` floats and is aligned to
+  // vectors. First the sums of each row and the partial derivatives with respect to the blurred a, aa and ab (planes
+  // [row, loss_stride]); once all rows are there, these are blurred both ways into the gradient.
+  void (*ssim_rows)(const PicturePair&, int first, int rows, float* const partial[3], LossSums* sums, float* scratch);
+  void (*ssim_gradient_rows)(const PicturePair&, int first, int rows, const float* const partial[3], float l1_scale,
+                             float ssim_scale, float* gradient, float* scratch);
   // The same two without similarity.
-  LossSums (*l1_row)(const PicturePair&, int row, float* const partial[3], float* scratch);
-  void (*l1_gradient_row)(const PicturePair&, int row, const float* const partial[3], float l1_scale,
-                          float ssim_scale, float* gradient, float* scratch);
-  // The blurred b and bb of a row.
-  void (*target_row)(const PicturePair&, int row, float* mean, float* square, float* scratch);
+  void (*l1_rows)(const PicturePair&, int first, int rows, float* const partial[3], LossSums* sums, float* scratch);
+  void (*l1_gradient_rows)(const PicturePair&, int first, int rows, const float* const partial[3], float l1_scale,
+                           float ssim_scale, float* gradient, float* scratch);
+  // The blurred b and bb of rows.
+  void (*target_rows)(const PicturePair&, int first, int rows, float* mean, float* square, float* scratch);
   TrainingKernels training;
 };
 

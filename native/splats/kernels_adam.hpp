@@ -32,13 +32,14 @@ RF_INLINE void store_moment(uint16_t* to, const Vec& value) {
 struct Adam {
   float beta1, beta2, unbias, least;
   RF_INLINE explicit Adam(const AdamTerms& terms)
-      : beta1(terms.beta1), beta2(terms.beta2), unbias(terms.unbias), least(terms.eps * terms.eps) {}
+      : beta1(terms.beta1), beta2(terms.beta2), unbias(terms.unbias),
+        least(__builtin_fmaxf(terms.eps * terms.eps, 1.2e-38f)) {}
 
   // The parameter after a step; the moments are moved in place.
   RF_INLINE Vec step(Vec value, Vec& first, Vec& second, Vec gradient, Vec rate) const {
     first = beta1 * first + (1.0f - beta1) * gradient;
     second = beta2 * second + (1.0f - beta2) * (gradient * gradient);
-    return value - rate * first / sqrt_vec(max_vec(second * unbias, splat_vec(least)));
+    return mul_from(rate * first, inverse_sqrt(max_vec(second * unbias, splat_vec(least))), value);
   }
 };
 
@@ -63,9 +64,40 @@ RF_INLINE void adam_span(const Adam& adam, int count, float* value, Moment* firs
   std::memcpy(second, seconds, count * sizeof(Moment));
 }
 
+// The rows of one Gaussian: parameters and moments.
+template <class Moment>
+struct AdamRow {
+  float* value;
+  Moment* first;
+  Moment* second;
+
+  RF_INLINE AdamRow(const Trained& array, size_t place)
+      : value(array.value + place), first(static_cast<Moment*>(array.first) + place),
+        second(static_cast<Moment*>(array.second) + place) {}
+  RF_INLINE void ask_for(int floats) const {
+    constexpr int kLine = 64 / sizeof(float), kMomentLine = 64 / sizeof(Moment);
+    for (int at = 0; at < floats; at += kLine) __builtin_prefetch(value + at, 1);
+    for (int at = 0; at < floats; at += kMomentLine) __builtin_prefetch(first + at, 1);
+    for (int at = 0; at < floats; at += kMomentLine) __builtin_prefetch(second + at, 1);
+  }
+};
+
+// What the mean square of the coefficients above the first adds to the gradient of `floats` <= 16 of them in rows of L;
+// their squares are added to `square`.
+template <int L>
+RF_INLINE Vec shrinking(const float* value, int floats, float shrink, Vec& square) {
+  alignas(64) float bands[kLanes];
+  store(bands, load_first(value, floats));
+  for (int at = 0; at < floats; at += L) bands[at] = 0.0f;
+  const Vec above = load(bands);
+  square += above * above;
+  return shrink * above;
+}
+
 template <int L, class Moment>
 double update_harmonics_of(const Shading& shading, const HarmonicsUpdate& update, const Adam& adam,
                            const uint32_t* sources, size_t count, const float* values, const float* gradient) {
+  constexpr size_t kAhead = 3;  // how early memory is asked for
   const int channels = shading.channels, width = shading.width(), row = channels * L;
   double squares = 0.0;
   for (size_t start = 0; start < count; start += kLanes) {
@@ -77,37 +109,33 @@ double update_harmonics_of(const Shading& shading, const HarmonicsUpdate& update
     for (int lane = 0; lane < lanes; ++lane) {
       const float* of = gradient + (start + lane) * width;
       const float* value = values + (start + lane) * width;
-      const size_t place = static_cast<size_t>(mine[lane]) * row;
-      for (int first = 0; first < row; first += kLanes) {
-        const int floats = row - first < kLanes ? row - first : kLanes;
-        Vec part;
-        if constexpr (L == kLanes) {
-          const int channel = first / L;
+      const AdamRow<Moment> at(update.sh, static_cast<size_t>(mine[lane]) * row);
+      if (start + lane + kAhead < count) {
+        AdamRow<Moment>(update.sh, static_cast<size_t>(mine[lane + kAhead]) * row).ask_for(row);
+      }
+      if constexpr (L == kLanes) {
+        const Vec basis = load(rows[lane]);
+        for (int channel = 0, first = 0; channel < channels; ++channel, first += L) {
           const bool stopped = shading.clamp && __builtin_signbit(value[channel]);
-          part = (stopped ? 0.0f : of[channel]) * load(rows[lane]);
-        } else {
-          alignas(64) float parts[kLanes] = {};
-          for (int at = 0; at < floats; ++at) {
-            const int channel = (first + at) / L;
+          Vec part = (stopped ? 0.0f : of[channel]) * basis;
+          if (update.shrink > 0.0f) part += shrinking<L>(at.value + first, L, update.shrink, square);
+          const Vec rate = load(update.rates + first);
+          adam_span(adam, L, at.value + first, at.first + first, at.second + first, part, rate);
+        }
+      } else {
+        for (int first = 0; first < row; first += kLanes) {
+          const int floats = row - first < kLanes ? row - first : kLanes;
+          alignas(64) float parts[kLanes] = {}, rates[kLanes] = {};
+          for (int i = 0; i < floats; ++i) {
+            const int channel = (first + i) / L;
             const bool stopped = shading.clamp && __builtin_signbit(value[channel]);
-            parts[at] = stopped ? 0.0f : of[channel] * rows[lane][(first + at) % L];
+            parts[i] = stopped ? 0.0f : of[channel] * rows[lane][(first + i) % L];
           }
-          part = load(parts);
+          Vec part = load(parts);
+          if (update.shrink > 0.0f) part += shrinking<L>(at.value + first, floats, update.shrink, square);
+          std::memcpy(rates, update.rates + first, floats * sizeof(float));
+          adam_span(adam, floats, at.value + first, at.first + first, at.second + first, part, load(rates));
         }
-        float* to = update.sh.value + place + first;
-        Moment* m = static_cast<Moment*>(update.sh.first) + place + first;
-        Moment* v = static_cast<Moment*>(update.sh.second) + place + first;
-        if (update.shrink > 0.0f) {
-          alignas(64) float bands[kLanes] = {};
-          std::memcpy(bands, to, floats * sizeof(float));
-          for (int at = 0; at < floats; at += L) bands[at] = 0.0f;
-          const Vec shrinking = load(bands);
-          square += shrinking * shrinking;
-          part += update.shrink * shrinking;
-        }
-        alignas(64) float rates[kLanes] = {};
-        std::memcpy(rates, update.rates + first, floats * sizeof(float));
-        adam_span(adam, floats, to, m, v, part, load(rates));
       }
     }
     squares += sum_of(square);

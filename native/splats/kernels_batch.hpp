@@ -26,12 +26,48 @@ RF_INLINE uint32_t blocks_inside(const Tile& tile) {
   return inside;
 }
 
+#if defined(__AVX512F__)
+// Three channels of four pixels a row are three fours of floats. With the rows' first, second and third fours in one
+// vector each, a channel is a choice of lanes from two of them, four by four, and one more from the third; and back.
+struct ThreeFours {
+  __m512 four[3];
+
+  static RF_INLINE __m512 rows(const float* from, size_t stride) {
+    __m512 all = _mm512_castps128_ps512(_mm_loadu_ps(from));
+    all = _mm512_insertf32x4(all, _mm_loadu_ps(from + stride), 1);
+    all = _mm512_insertf32x4(all, _mm_loadu_ps(from + 2 * stride), 2);
+    return _mm512_insertf32x4(all, _mm_loadu_ps(from + 3 * stride), 3);
+  }
+  RF_INLINE void load_channels(const float* from, size_t stride, Vec* out) {
+    for (int at = 0; at < 3; ++at) four[at] = rows(from + 4 * at, stride);
+    // r0 g0 b0 r1 | g1 b1 r2 g2 | b2 r3 g3 b3
+    const __m512 a = four[0], b = four[1], c = four[2];
+    const __m512 r23 = _mm512_shuffle_ps(b, c, _MM_SHUFFLE(1, 1, 2, 2));
+    const __m512 b01 = _mm512_shuffle_ps(a, b, _MM_SHUFFLE(1, 1, 2, 2));
+    const __m512 g01 = _mm512_shuffle_ps(a, b, _MM_SHUFFLE(0, 0, 1, 1));
+    const __m512 g23 = _mm512_shuffle_ps(b, c, _MM_SHUFFLE(2, 2, 3, 3));
+    out[0] = (Vec)_mm512_shuffle_ps(a, r23, _MM_SHUFFLE(2, 0, 3, 0));
+    out[1] = (Vec)_mm512_shuffle_ps(g01, g23, _MM_SHUFFLE(2, 0, 2, 0));
+    out[2] = (Vec)_mm512_shuffle_ps(b01, c, _MM_SHUFFLE(3, 0, 2, 0));
+  }
+};
+#endif
+
 // A block's share of a picture [row, col, channels]: the lanes of C channels from `first` on, zero beside the picture.
 template <int C>
 RF_INLINE void load_block(const Tile& tile, int block, const float* picture, int channels, int first, Vec* out) {
-  alignas(64) float lanes[C][kLanes];
   const int x = block_x(tile, block), y = block_y(tile, block);
   const int cols = tile.view->width - x, rows = tile.view->height - y;
+#if defined(__AVX512F__)
+  if ((C == 1 || C == 3) && channels == C && cols >= 4 && rows >= 4) {
+    const size_t stride = static_cast<size_t>(tile.view->width) * C;
+    const float* from = picture + y * stride + static_cast<size_t>(x) * C;
+    if constexpr (C == 3) return ThreeFours().load_channels(from, stride, out);
+    out[0] = (Vec)ThreeFours::rows(from, stride);
+    return;
+  }
+#endif
+  alignas(64) float lanes[C][kLanes];
   if (cols < 4 || rows < 4) std::memset(lanes, 0, sizeof(lanes));
   for (int row = 0; row < 4 && row < rows; ++row) {
     const float* from = picture + (static_cast<size_t>(y + row) * tile.view->width + x) * channels + first;

@@ -169,9 +169,14 @@ RF_INLINE Upstream<C> upstream_of_block(const Tile& tile, const Slopes& slopes, 
 template <int kSums, int kRow>
 struct Pending {
   static constexpr int kMost = kSums <= 4 ? 8 : 4;
-  Vec parts[kMost * kSums];
+  Half parts[kMost * kSums];
   int index[kMost];
   int count = 0;
+
+  RF_INLINE void take(int row, const Vec* sums) {
+    for (int at = 0; at < kSums; ++at) parts[count * kSums + at] = halves_added(sums[at]);
+    index[count++] = row;
+  }
 
   RF_INLINE void add_to(float* rows) {
     alignas(64) float sums[kMost * kSums + 4];
@@ -213,7 +218,7 @@ void blend_channels_backward(const Tile& tile, const Slopes& slopes) {
         const int index = batch.list[block][at];
         const Drawn<Shape, C>& drawn = batch.drawn[index];
         const Step<Shape> step = advance<Shape, kGate>(drawn.splat, pixels, tile.gate, light);
-        Vec* const parts = pending.parts + pending.count * kSums;
+        Vec parts[kSums];
         Vec worth = upstream.h;
         for (int channel = 0; channel < C; ++channel) {
           worth = mul_add(upstream.g[channel], splat_vec(drawn.value[channel]), worth);
@@ -225,7 +230,7 @@ void blend_channels_backward(const Tile& tile, const Slopes& slopes) {
         const Mask free = both(step.counts, below(step.alpha, splat_vec(kAlphaMax)));
         parts[C] = keep(free, own - hidden);
         if constexpr (kGeometry) Shape::geometry_parts(step.point, parts[C], parts + C + 1);
-        pending.index[pending.count++] = index;
+        pending.take(index, parts);
         if (pending.count == pending.kMost) pending.add_to(rows);
         if (!any(step.counts)) {
           alive &= ~(1u << block);

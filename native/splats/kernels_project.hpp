@@ -10,6 +10,7 @@
 #include "core/vector.hpp"
 #include "splats/constants.hpp"
 #include "splats/kernels.hpp"
+#include "splats/kernels_bounds.hpp"
 
 namespace {
 
@@ -34,25 +35,6 @@ struct Projection {
   Vec sxx, sxy, syy, inverse_determinant;
   Vec screen_x, screen_y;
   IntVec fine;           // a Gaussian that can be drawn
-};
-
-// Sixteen Gaussians side by side, or those whose indices are given.
-struct Neighbours {
-  size_t start;
-  int lanes;
-  template <int N>
-  RF_INLINE void columns(const float* from, Vec* out) const {
-    load_columns_from<N>(from + N * start, lanes, out);
-  }
-};
-
-struct Chosen {
-  const uint32_t* sources;
-  int lanes;
-  template <int N>
-  RF_INLINE void columns(const float* from, Vec* out) const {
-    load_columns_at<N>(from, sources, lanes, out);
-  }
 };
 
 constexpr float kHalfLog2E = 0.5f * 1.442695040888963f;
@@ -126,7 +108,6 @@ RF_INLINE void project_centres(const View& view, const Geometry& in, const Which
 // Whether any of the Gaussians may touch the picture: the rows of J have the lengths fx sqrt(1 + u^2) / z and
 // fy sqrt(1 + v^2) / z, and no Gaussian is longer than its largest scale.
 RF_INLINE bool may_be_seen(const View& view, const Vec& opacity, const Projection& p) {
-  constexpr float kReach2 = 11.09f;  // no Gaussian reaches further than sqrt(2 ln 255) standard deviations
   const Vec scale = max_vec(p.s[0], max_vec(p.s[1], p.s[2])) * p.inverse_z, scale2 = scale * scale * (1.01f * kReach2);
   const Vec wide = sqrt_vec(scale2 * (view.fx * view.fx) * (1.0f + p.u * p.u) + kReach2 * kBlur) + 1.0f;
   const Vec tall = sqrt_vec(scale2 * (view.fy * view.fy) * (1.0f + p.v * p.v) + kReach2 * kBlur) + 1.0f;
@@ -164,52 +145,66 @@ RF_INLINE void project_shapes(const View& view, const Geometry& in, const Which&
   p.inverse_determinant = 1.0f / determinant;
 }
 
-size_t project(const View& view, const Geometry& in, size_t begin, size_t end, const Projected& out) {
+// Sixteen neighbours from `start` on; `visible` counts the splats that are written.
+RF_INLINE void project_group(const View& view, const Geometry& in, size_t start, size_t end, const Projected& out,
+                             size_t& visible) {
+  const int lanes = static_cast<int>(end - start < kLanes ? end - start : kLanes);
+  const Neighbours which = {start, lanes};
+  Projection p;
+  project_centres(view, in, which, p);
+  const Vec opacity = load_some(in.opacities + start, lanes);
+  if (in.offset != nullptr) {
+    Vec offset[2];
+    which.template columns<2>(in.offset, offset);
+    p.screen_x += offset[0];
+    p.screen_y += offset[1];
+  }
+  if (!may_be_seen(view, opacity, p)) return;
+  project_shapes(view, in, which, p);
+  IntVec fine = p.fine & (opacity >= kAlphaMin) & is_finite(opacity);
+  fine &= is_finite(p.screen_x) & is_finite(p.screen_y);
+  const Vec middle = 0.5f * (p.sxx + p.syy), half = 0.5f * (p.sxx - p.syy);
+  const Vec major = middle + sqrt_vec(half * half + p.sxy * p.sxy);
+  // Half of d^T Sigma2^-1 d is |(p dx + r dy, s dy)|^2 with a triangular root, which does not cancel.
+  const Vec root_p = sqrt_vec(kHalfLog2E * p.syy * p.inverse_determinant), root_s = sqrt_vec(kHalfLog2E / p.syy);
+  const Vec root_r = -root_p * p.sxy / p.syy;
+  fine &= is_finite(root_p) & is_finite(root_r) & is_finite(root_s) & is_finite(major);
+  const Vec above_cut = log2_above_cut(opacity), reach = sqrt_vec(above_cut * (1.0f / kHalfLog2E));
+  const Vec box_x = reach * sqrt_vec(p.sxx), box_y = reach * sqrt_vec(p.syy);
+  const Vec extent[4] = {p.screen_x - box_x, p.screen_y - box_y, p.screen_x + box_x, p.screen_y + box_y};
+  fine &= (extent[2] > 0.0f) & (extent[0] < static_cast<float>(view.width));
+  fine &= (extent[3] > 0.0f) & (extent[1] < static_cast<float>(view.height));
+  const Vec splat[8] = {p.screen_x, p.screen_y, root_p, root_r, root_s, above_cut + kLog2AlphaMin, p.z, Vec{}};
+  alignas(64) float radius[kLanes], nobody[8];
+  store(radius, reach * sqrt_vec(major));
+  const uint32_t seen = bits_of(fine) & ((1u << lanes) - 1u);
+  float *splats[kLanes], *extents[kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) splats[lane] = extents[lane] = nobody;
+  for (uint32_t left = seen; left != 0; left &= left - 1) {
+    const int lane = __builtin_ctz(left);
+    splats[lane] = out.splats + 8 * visible;
+    extents[lane] = &out.extents[visible].left;
+    out.sources[visible] = static_cast<uint32_t>(start + lane);
+    out.radii[start + lane] = radius[lane];
+    ++visible;
+  }
+  store_columns<8>(splat, splats, kLanes);
+  store_columns<4>(extent, extents, kLanes);
+}
+
+size_t project(const View& view, const Geometry& in, size_t gaussians, size_t begin, size_t end, const Projected& out) {
   size_t visible = 0;
   std::memset(out.radii + begin, 0, (end - begin) * sizeof(float));
-  for (size_t start = begin; start < end; start += kLanes) {
-    const int lanes = static_cast<int>(end - start < kLanes ? end - start : kLanes);
-    const Neighbours which = {start, lanes};
-    Projection p;
-    project_centres(view, in, which, p);
-    const Vec opacity = load_some(in.opacities + start, lanes);
-    if (in.offset != nullptr) {
-      Vec offset[2];
-      which.template columns<2>(in.offset, offset);
-      p.screen_x += offset[0];
-      p.screen_y += offset[1];
+  const Sides sides(view);
+  const bool bounded = in.bounds != nullptr && in.offset == nullptr;
+  for (size_t start = begin; start < end; start += kLanes * kBoundGroup) {
+    uint32_t left = 0xffff;
+    if (bounded) left = sides.seen(in.bounds, bound_groups(gaussians), start / kBoundGroup);
+    for (; left != 0; left &= left - 1) {
+      const size_t first = start + __builtin_ctz(left) * kBoundGroup;
+      if (first >= end) break;
+      project_group(view, in, first, end, out, visible);
     }
-    if (!may_be_seen(view, opacity, p)) continue;
-    project_shapes(view, in, which, p);
-    IntVec fine = p.fine & (opacity >= kAlphaMin) & is_finite(opacity);
-    fine &= is_finite(p.screen_x) & is_finite(p.screen_y);
-    const Vec middle = 0.5f * (p.sxx + p.syy), half = 0.5f * (p.sxx - p.syy);
-    const Vec major = middle + sqrt_vec(half * half + p.sxy * p.sxy);
-    // Half of d^T Sigma2^-1 d is |(p dx + r dy, s dy)|^2 with a triangular root, which does not cancel.
-    const Vec root_p = sqrt_vec(kHalfLog2E * p.syy * p.inverse_determinant), root_s = sqrt_vec(kHalfLog2E / p.syy);
-    const Vec root_r = -root_p * p.sxy / p.syy;
-    fine &= is_finite(root_p) & is_finite(root_r) & is_finite(root_s) & is_finite(major);
-    const Vec above_cut = log2_above_cut(opacity), reach = sqrt_vec(above_cut * (1.0f / kHalfLog2E));
-    const Vec box_x = reach * sqrt_vec(p.sxx), box_y = reach * sqrt_vec(p.syy);
-    const Vec extent[4] = {p.screen_x - box_x, p.screen_y - box_y, p.screen_x + box_x, p.screen_y + box_y};
-    fine &= (extent[2] > 0.0f) & (extent[0] < static_cast<float>(view.width));
-    fine &= (extent[3] > 0.0f) & (extent[1] < static_cast<float>(view.height));
-    const Vec splat[8] = {p.screen_x, p.screen_y, root_p, root_r, root_s, above_cut + kLog2AlphaMin, p.z, Vec{}};
-    alignas(64) float radius[kLanes], nobody[8];
-    store(radius, reach * sqrt_vec(major));
-    const uint32_t seen = bits_of(fine) & ((1u << lanes) - 1u);
-    float *splats[kLanes], *extents[kLanes];
-    for (int lane = 0; lane < kLanes; ++lane) splats[lane] = extents[lane] = nobody;
-    for (uint32_t left = seen; left != 0; left &= left - 1) {
-      const int lane = __builtin_ctz(left);
-      splats[lane] = out.splats + 8 * visible;
-      extents[lane] = &out.extents[visible].left;
-      out.sources[visible] = static_cast<uint32_t>(start + lane);
-      out.radii[start + lane] = radius[lane];
-      ++visible;
-    }
-    store_columns<8>(splat, splats, kLanes);
-    store_columns<4>(extent, extents, kLanes);
   }
   return visible;
 }

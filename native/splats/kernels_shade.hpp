@@ -83,6 +83,14 @@ RF_INLINE float finished_value(const Shading& shading, float sum, size_t source,
   return shading.clamp && value < 0.0f ? -0.0f : value;
 }
 
+// Asks for the coefficients of sixteen Gaussians, which lie wherever they lie, before they are read.
+RF_INLINE void ask_for_rows(const float* coefficients, const uint32_t* sources, int lanes, size_t floats) {
+  constexpr size_t kLine = 64 / sizeof(float);
+  for (int lane = 0; lane < lanes; ++lane) {
+    for (size_t at = 0; at < floats; at += kLine) __builtin_prefetch(coefficients + sources[lane] * floats + at);
+  }
+}
+
 template <int L>
 void shade_rows(const Shading& shading, const uint32_t* sources, size_t count, float* values) {
   const int channels = shading.channels, width = shading.width();
@@ -91,6 +99,10 @@ void shade_rows(const Shading& shading, const uint32_t* sources, size_t count, f
     const uint32_t* mine = sources + start;
     float* to = values + start * width;
     const Rays rays = rays_of(shading, mine, lanes);
+    if (start + kLanes < count) {
+      const int next = static_cast<int>(count - start - kLanes < kLanes ? count - start - kLanes : kLanes);
+      ask_for_rows(shading.coefficients, mine + kLanes, next, static_cast<size_t>(channels) * L);
+    }
     alignas(64) float rows[kLanes][kLanes];
     basis_rows(rays, shading.bases, L, rows);
     const Vec& range = rays.range;

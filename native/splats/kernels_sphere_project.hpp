@@ -137,7 +137,7 @@ RF_INLINE Vec block_reach(const View& view, const SphereProjection& s, Vec above
   return select(trusted, reach * reach, splat_vec(__builtin_inff()));
 }
 
-size_t project_sphere(const View& view, const Geometry& in, size_t begin, size_t end, const Projected& out) {
+size_t project_sphere(const View& view, const Geometry& in, size_t, size_t begin, size_t end, const Projected& out) {
   const float per_pixel = 1.0f / __builtin_sqrtf(pixel_area(view));
   size_t visible = 0;
   std::memset(out.radii + begin, 0, (end - begin) * sizeof(float));

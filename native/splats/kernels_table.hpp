@@ -2,6 +2,7 @@
 #pragma once
 
 #include "splats/kernels_adam.hpp"
+#include "splats/kernels_bounds.hpp"
 #include "splats/kernels_compositing.hpp"
 #include "splats/kernels_harmonics.hpp"
 #include "splats/kernels_loss.hpp"
@@ -14,9 +15,9 @@
   namespace rf3dgs {                                                                                           \
   const Kernels& function() {                                                                                  \
     static constexpr Kernels table = {name, {pinhole_kernels(), sphere_kernels()},                              \
-                                      ::harmonics, ::harmonics_backward,                                       \
-                                      ::ssim_row, ::ssim_gradient_row, ::l1_row, ::l1_gradient_row,            \
-                                      ::target_row,                                                            \
+                                      ::bound, ::harmonics, ::harmonics_backward,                              \
+                                      ::ssim_rows, ::ssim_gradient_rows, ::l1_rows, ::l1_gradient_rows,        \
+                                      ::target_rows,                                                           \
                                       {::shade, ::shade_plain, ::update_harmonics, ::update_shapes,           \
                                        ::exponentials, ::sigmoids, ::finish, ::finish_backward}};             \
     return table;                                                                                              \

@@ -39,7 +39,7 @@ void project_chunk(Scene& scene, const Geometry& geometry, const ValuesOf& value
   Extent* const extents = memory.extents.data() + begin;
   float* const values = memory.values.data() + begin * channels;
   const Projected out = {memory.splats.data() + begin * shape.splat_floats, sources, extents, radii};
-  const size_t visible = shape.project(scene.view, geometry, begin, last, out);
+  const size_t visible = shape.project(scene.view, geometry, scene.gaussians, begin, last, out);
   memory.chunk_visible[chunk] = static_cast<uint32_t>(visible);
   if (visible > 0) values_of(begin, begin + visible, sources, values);
   if (!all_finite(values, visible * channels)) {
@@ -62,7 +62,8 @@ void project(Scene& scene, const Geometry& geometry, const ValuesOf& values_of, 
   memory.extents.resize(scene.gaussians);
   memory.values.resize(scene.gaussians * scene.channels);
   memory.slots.resize(chunks * (kChunk + 1));
-  memory.tile_counts.resize(chunks * scene.tiles());
+  memory.unsorted.resize(scene.gaussians);
+  memory.chunk_keys.resize(chunks);
   if (memory.found.size() < chunks) memory.found.resize(chunks);
   parallel_for(scene.chunks(), threads,
                [&](int chunk) { project_chunk(scene, geometry, values_of, chunk, radii); });
@@ -178,7 +179,6 @@ std::unique_ptr<Scene> rasterize(const View& view, size_t count, const Geometry&
                        max_weight == nullptr ? nullptr : memory.peaks.resize(scene->entries)};
   parallel_for(scene->tiles(), threads, [&](int index) {
     Tile tile = tile_of(*scene, index);
-    sort_by_depth(*scene, index);
     for (; tile.first < channels; tile.first += tile.chunk) {
       tile.chunk = next_chunk(channels - tile.first);
       shape.blend(tile, out);

@@ -1,11 +1,11 @@
 // The rasterizer: Gaussians in, picture out, and back.
 //
-// Forward: project chunks of Gaussians and keep what is visible, ask the caller for the values of these, list for every
-// 16x16 tile the splats that reach it, sort each list by depth (ties by index), blend. Backward: blend once more per tile into a row of
-// gradients per list entry, add these per Gaussian in the order of the tiles, take them back through the projection and
-// hand them to the caller. Only the lists are in depth order: the splats and all that is kept for them stay in the order
-// of the Gaussians, so that memory is read as it lies. Every sum has one order and every chunk one place, so results do
-// not depend on the number of threads.
+// Forward: project chunks of Gaussians and keep what is visible, ask the caller for the values of these, sort them
+// by depth (ties by index), list for every 16x16 tile the splats that reach it, blend. Backward: blend once more per
+// tile into a row of gradients per list entry, add these per Gaussian in the order of the tiles, take them back
+// through the projection and hand them to the caller. Only the lists are in depth order: the splats and all that is
+// kept for them stay in the order of the Gaussians, so that memory is read as it lies. Every sum has one order and
+// every chunk one place, so results do not depend on the number of threads.
 #pragma once
 
 #include <functional>

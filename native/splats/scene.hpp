@@ -13,6 +13,15 @@ namespace rf3dgs {
 // The Gaussians are cut into chunks of this many: the unit of work of everything that is done per Gaussian.
 constexpr size_t kChunk = 2048;
 
+// The bits of a splat's depth, and the first of its slots: among those of its chunk, or of all.
+struct DepthKey {
+  uint32_t depth_bits, slot;
+};
+struct DepthRange {
+  uint32_t low = UINT32_MAX, high = 0;  // bits of depths
+  size_t count = 0;                     // of splats that reach a tile
+};
+
 // Places number the visible splats: chunk * kChunk for the first of a chunk, gaps behind the last. They keep the order of
 // the Gaussians.
 struct SceneMemory {
@@ -29,9 +38,14 @@ struct SceneMemory {
   Buffer<size_t> chunk_slot;       // [chunk + 1]
   Buffer<uint32_t> slots;          // [chunk, kChunk + 1] first slot of each splat after the chunk's first
   // Of the passes themselves.
-  std::vector<Buffer<Found>> found;  // [chunk]
-  Buffer<uint32_t> tile_counts;      // [chunk, tile]
-  Buffer<Entry> unsorted;
+  std::vector<Buffer<Found>> found;   // [chunk]
+  Buffer<Found> all_found;            // [slot]
+  Buffer<DepthKey> unsorted;          // [place] those of a chunk side by side
+  Buffer<size_t> chunk_first_key;     // [chunk + 1]
+  Buffer<DepthRange> chunk_keys;      // [chunk]
+  Buffer<DepthKey> keys[2];           // of all chunks, before and after a pass of sorting
+  Buffer<uint32_t> key_counts;        // [segment, bucket]
+  Buffer<uint32_t> tile_counts;       // [segment, tile]
   Buffer<float> peaks;               // [slot]
   Buffer<float> rows;                // [slot, gradient_row]
   Buffer<float> values_gradient;     // [place, channels]

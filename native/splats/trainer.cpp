@@ -65,7 +65,7 @@ void observe(const Population& population, const View& view, const float* radii,
 }
 
 Geometry geometry_of(const Population& population) {
-  return {population.means, population.quats, population.scales, population.opacities, nullptr};
+  return {population.means, population.quats, population.scales, population.opacities, nullptr, population.bounds};
 }
 
 // Calls work(first, count) for every run of drawn splats among `count`.
@@ -120,6 +120,17 @@ void Trainer::draw_raw(const Population& population, const Drawing& drawing, int
                        kernels().training.shade(shading, sources, end - begin, values);
                      },
                      drawing.background, drawing.gate, threads, raw_.data(), weight_.data(), radii_.data());
+}
+
+void Trainer::copy_radii(const Population& population, int threads, float* out) const {
+  std::fill_n(out, population.count, 0.0f);
+  const SceneMemory& memory = *scene_->memory;
+  parallel_for(scene_->chunks(), threads, [&](int chunk) {
+    const uint32_t* const sources = memory.sources.data() + chunk * kChunk;
+    for (size_t at = 0; at < memory.chunk_visible[chunk]; ++at) {
+      out[population.order[sources[at]]] = radii_[sources[at]];
+    }
+  });
 }
 
 void Trainer::draw(const Population& population, const Drawing& drawing, int threads, float* picture, float* weight) {

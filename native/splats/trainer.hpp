@@ -20,6 +20,7 @@ struct Population {
   size_t count;
   const float *means, *quats;
   float *scales, *opacities;  // activated
+  float* bounds;              // of groups (see `Geometry`), or null where means or scales move
   const float* sh;            // [gaussian, channels, lanes]
   Trained trained_means, trained_quats, trained_log_scales, trained_logits, trained_sh;
   const float* base;   // [gaussian, channels] or null
@@ -65,8 +66,9 @@ class Trainer {
   double step(const Population& population, const Drawing& drawing, const LossTarget& target, float ssim_weight,
               const Rates& rates, int threads);
 
-  // [gaussian] of the last drawing, in the trainer's order [pixel].
+  // [gaussian] of the last drawing, in the trainer's order [pixel]; and a copy in the caller's order.
   const float* radii() const { return radii_.data(); }
+  void copy_radii(const Population& population, int threads, float* out) const;
   bool has_drawn() const { return scene_ != nullptr; }
   const Drawing& drawing() const { return drawing_; }
 

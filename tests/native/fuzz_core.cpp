@@ -276,7 +276,7 @@ void harmonics() {
 
 // Arrays of a trainer and what it is told about them.
 struct School {
-  Floats means, quats, log_scales, logits, scales, opacities, sh, base, along, extra, screen;
+  Floats means, quats, log_scales, logits, scales, opacities, sh, base, along, extra, screen, bounds;
   std::vector<Floats> moments;
   std::vector<std::vector<uint16_t>> half_moments;
   std::vector<uint32_t> order;
@@ -320,6 +320,11 @@ struct School {
     of.scales = scales.data();
     of.opacities = opacities.data();
     of.sh = sh.data();
+    if (!geometry) {
+      bounds.resize(kBoundColumns * bound_groups(count));
+      kernels().bound(means.data(), scales.data(), count, 0, bound_groups(count), bounds.data());
+      of.bounds = bounds.data();
+    }
     if (geometry) {
       of.trained_means = trained(means);
       of.trained_quats = trained(quats);

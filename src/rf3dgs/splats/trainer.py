@@ -40,9 +40,9 @@ class Trainer:
 
     `degree` is the degree that is drawn and trained, at first that of sh; `steps` counts the updates. Directions count
     as fixed: means get no gradient from the harmonics. Memory of the native engine: 4 bytes for every
-    parameter, 8 (4) for its moments if it is trained, and 20 for the order and the activated scales and opacities; a
-    Gaussian with 16 coefficients of one channel whose opacity is trained takes 264 bytes, with three channels and all
-    trained 740.
+    parameter, 8 (4) for its moments if it is trained, 20 for the order and the activated scales and opacities, and
+    where the geometry rests 1.25 for the bounds of sixteen neighbours; a Gaussian with 16 coefficients of one channel
+    whose opacity is trained takes 265 bytes, with three channels and all trained 740.
     """
 
     def __init__(

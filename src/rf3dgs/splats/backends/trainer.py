@@ -15,7 +15,7 @@ from rf3dgs.splats.rates import Rates
 from rf3dgs.splats.target import Target
 
 SHARED = ("means", "quats", "log_scales", "logit_opacities")
-ACTIVATED = ("scales", "opacities")
+ACTIVATED = ("scales", "opacities", "bounds")  # no bounds where the geometry moves
 
 
 class NativeEngine:
@@ -29,7 +29,7 @@ class NativeEngine:
         core().morton_order(means, order)
         rows = order.long()
         memory = {name: tensors[name][rows] for name in SHARED}
-        memory |= {"order": order, "scales": torch.empty(len(means), 3), "opacities": torch.empty(len(means))}
+        memory |= {"order": order, **_activated(len(means), scheme)}
         self._begin(scheme, memory, tensors["sh"], base, along)
         self.trainer.activate()
 
@@ -40,7 +40,7 @@ class NativeEngine:
         self.scheme, self.base, self.along = scheme, base, along
         self.count, self.coefficients, self.channels = sh.shape
         self.lanes = 16 if self.coefficients == 9 else self.coefficients
-        self._activated = {name: shared[name] for name in ACTIVATED}
+        self._activated = {name: shared[name] for name in ACTIVATED if name in shared}
         self.memory = {name: tensor for name, tensor in shared.items() if name not in ACTIVATED}
         self.memory["sh"] = torch.zeros(self.count, self.channels, self.lanes)
         for name in scheme.trained:
@@ -96,7 +96,7 @@ class NativeEngine:
             check_whole(memory)
             self.memory = {name: memory[name].clone() for name in self.memory}
             self.count = len(self.memory["means"])
-            self._activated = {"scales": torch.empty(self.count, 3), "opacities": torch.empty(self.count)}
+            self._activated = _activated(self.count, self.scheme)
             self._bind()
         self.trainer.activate()
 
@@ -138,6 +138,12 @@ class NativeEngine:
         names = (*SHARED, "order")
         other._begin(scheme, {name: self.memory[name] for name in names} | self._activated, sh, base, along)
         return other
+
+
+def _activated(count: int, scheme: Scheme) -> dict[str, Tensor]:
+    """Room for what follows from the parameters."""
+    room = {"scales": torch.empty(count, 3), "opacities": torch.empty(count)}
+    return room if "geometry" in scheme.train else room | {"bounds": torch.empty(core().bounds_shape(count))}
 
 
 def look_arguments(look: Look) -> tuple[Any, ...]:
