@@ -1,5 +1,6 @@
 """Tracing many receivers as a job in shards: a folder of paths that a killed run leaves sound."""
 
+import gc
 import math
 import secrets
 from collections.abc import Mapping
@@ -71,6 +72,7 @@ class TraceTask:
                     )
                 writer.append(bin_diffuse(paths, cell=cell, delay_step=config.delay_step), traced=count)
                 each()
+        gc.collect()  # a tracer leaves cycles behind, which the command line's thresholds would keep for hours
         return {self.file: content.getvalue()}
 
 
