@@ -189,6 +189,16 @@ def test_no_sweep_and_no_leap_explains_less():
             assert fit.residual_power <= before * (1 + 1e-12)
 
 
+def test_two_paths_in_one_place_that_cancel_become_one():
+    sounding = sound(three_paths(2, FULL)._map(lambda value: value[:1]), SMALL)
+    fit = Fit(Aperture.of(sounding), sounding.response, float(sounding.noise_power))
+    fit.search(1, selective=False)
+    fit._set(fit.theta.repeat(2, 1), torch.stack((101.0 * fit.gain[0], -100.0 * fit.gain[0])))
+    fit._until_settled = lambda: None  # as if it had settled there
+    fit.settle(selective=False)
+    assert len(fit.gain) == 1
+
+
 def test_elements_that_hear_backwards_show_it_mirrored_ahead():
     sounder = replace(SILENT, array_rx=planar_array(4, 4, "isotropic"))
     truth = three_paths(3, FULL)._map(lambda value: value[:1])

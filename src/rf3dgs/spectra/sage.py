@@ -57,11 +57,11 @@ def sage(
 ) -> Paths:
     """The dominant paths `[*batch, path]` of a sounding, strongest first; `order` and `kind` are None.
 
-    count: how many per receiver; None stops by itself where one more path explains less than its description costs
-    (minimum description length), at the latest at `limit`. The noise power counts there; unknown, it is taken from the
-    residual. What an array cannot tell (one row: zenith, one column: azimuth) raises InputError, unless `untold` is
-    "ahead": then it is taken to be straight ahead of the device. Arrivals and departures are ahead of the arrays, in
-    their fields of view.
+    count: how many per receiver, fewer where two would share one place and cancel; None stops by itself where one more
+    path explains less than its description costs (minimum description length), at the latest at `limit`. The noise
+    power counts there; unknown, it is taken from the residual. What an array cannot tell (one row: zenith, one column:
+    azimuth) raises InputError, unless `untold` is "ahead": then it is taken to be straight ahead of the device.
+    Arrivals and departures are ahead of the arrays, in their fields of view.
 
     Delays lie between that of the straight line and one period of the comb more. With an unknown delay offset the
     earliest path found is taken to be the straight line. `coeff` times e^{-j 2 pi f delay} is the gain measured, but

@@ -18,6 +18,7 @@ SWEEPS = 200
 MOVED = 0.01  # of its deviation: a path that moves less in a sweep has arrived
 EARLY = 8  # sweeps after each new path, fewer where they explain nothing that noise does not
 HALVINGS = 3
+CANCELLING = 4.0  # times the mean power of the response: no path is so strong by itself
 LEAPS = 3  # joint steps tried, each damped more than the one before
 
 
@@ -65,14 +66,19 @@ class Fit:
                 return
 
     def settle(self, *, selective: bool) -> None:
-        """Sweep over all paths until none moves any more; then drop what explains less than it costs, and again."""
+        """Sweep over all paths until none moves any more; then drop what explains less than it costs, and again.
+
+        Paths much stronger than the whole response are two that share one place and cancel: one of them goes, always.
+        """
         self._until_settled()
-        while selective and len(self.gain) > 1:
+        while len(self.gain) > 1:
             worth = self._worth()
-            least = int(worth.argmin())
-            if float(worth[least]) >= self.penalty * self.noise:
+            cancelling = self.gain.abs().square() > CANCELLING * self.power
+            if bool(cancelling.any()):
+                worth = torch.where(cancelling, worth, torch.inf)
+            elif not selective or float(worth.min()) >= self.penalty * self.noise:
                 return
-            kept = torch.arange(len(self.gain)) != least
+            kept = torch.arange(len(self.gain)) != int(worth.argmin())
             self._set(self.theta[kept], self.gain[kept])
             self._until_settled()
 
