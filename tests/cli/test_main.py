@@ -165,7 +165,7 @@ def test_photos_never_replace_a_folder_of_something_else(tmp_path, capsys):
     (folder / "00000.jpg").touch()
     (folder / "diary.txt").write_text("dear diary")
     assert main(["photos", "lobby", "--out", str(folder)]) == 2
-    assert "holds something else than a tour, such as diary.txt; choose another name" in capsys.readouterr().err
+    assert "has no manifest.json but holds 00000.jpg; choose another name" in capsys.readouterr().err
     assert (folder / "diary.txt").read_text() == "dear diary"
 
 

@@ -15,8 +15,11 @@ PHOTO = ("--photo.width", "24", "--photo.height", "16", "--photo.samples", "1")
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        ("trace box --preset paper --trace.rays 5", "--preset paper sets how paths are traced; give it or --trace.*"),
-        ("trace box --rx.count 0", "--rx.count must be at least 1; got 0"),
+        (
+            "trace box --preset paper --trace.rays 5",
+            "the preset 'paper' is a whole set and says how paths are traced; leave out other settings",
+        ),
+        ("trace box --rx.count 0", "count from 1 to 1000000; got 0.35 and 0"),
         ("trace box --shard-size 0", "--shard-size must be at least 1; got 0"),
         ("trace box --workers 0", "--workers must be at least 1; got 0"),
         ("trace box --workers 2 --cluster tcp://127.0.0.1:9", "give one of them"),

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, Panorama, View, equirect_grid, pinhole_grid
-from rf3dgs.splats.backends.core import native_core
+from rf3dgs.core.native import native_core
 from rf3dgs.splats.compositing import Compositing
 from rf3dgs.splats.raster import Raster
 from rf3dgs.splats.rasterize import Backend, rasterize

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from tests.splats.conformance import CASES, check, check_resampled
 
-from rf3dgs.splats.backends.core import native_core
+from rf3dgs.core.native import native_core
 
 ROOT = Path(__file__).parents[2]
 ACROSS = [

@@ -11,7 +11,7 @@ import torch
 
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, pinhole_grid
-from rf3dgs.splats.backends.core import native_core
+from rf3dgs.core.native import native_core
 from rf3dgs.splats.harmonics import evaluate, view_directions
 from rf3dgs.splats.image_loss import l1_ssim
 from rf3dgs.splats.rasterize import rasterize

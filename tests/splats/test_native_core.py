@@ -8,7 +8,7 @@ from torch import Tensor
 
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, pinhole_grid
-from rf3dgs.splats.backends.core import native_core
+from rf3dgs.core.native import native_core
 from rf3dgs.splats.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
 from rf3dgs.splats.projection import project
 

@@ -8,7 +8,7 @@ import torch
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, Panorama, equirect_grid, pinhole_grid, sample_grid
-from rf3dgs.splats.backends.core import native_core
+from rf3dgs.core.native import native_core
 from rf3dgs.splats.constants import BLUR
 from rf3dgs.splats.projection import pixel_area, project_sphere, sphere_directions, tangent_axes
 from rf3dgs.splats.raster import Raster

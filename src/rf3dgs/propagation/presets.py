@@ -34,9 +34,14 @@ class Preset:
     def applied(self, scene: Scene, config: TraceConfig | None = None) -> tuple[Scene, TraceConfig]:
         """The scene and the configuration under this preset; what the configuration says otherwise stays.
 
-        Raises InputError when the configuration names another frequency, or a material is not defined at this one.
+        Raises InputError when the configuration names another frequency or changes a whole set, or a material is not defined at this one.
         """
         config = TraceConfig() if config is None else config
+        if self.min_paths and config != TraceConfig(seed=config.seed, frequency=config.frequency):
+            raise InputError(
+                f"the preset {self.name!r} is a whole set and says how paths are traced; leave out other settings, or "
+                "take the preset 'diffuse' with them"
+            )
         if config.frequency is not None and config.frequency != self.frequency:
             raise InputError(
                 f"the preset {self.name!r} is made for {self.frequency / 1e9:g} GHz; got the frequency "

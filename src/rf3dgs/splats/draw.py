@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.grids import View
+from rf3dgs.core.native import thread_count
 from rf3dgs.splats.backends import native
-from rf3dgs.splats.backends.core import thread_count
 from rf3dgs.splats.backends.trainer import look_arguments
 from rf3dgs.splats.compositing import Compositing
 from rf3dgs.splats.engine import BLEND_ONLY, make_look

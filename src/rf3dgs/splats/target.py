@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.errors import InputError
+from rf3dgs.core.native import thread_count
 from rf3dgs.splats.backends import native
-from rf3dgs.splats.backends.core import thread_count
 
 
 @dataclass(frozen=True, eq=False)

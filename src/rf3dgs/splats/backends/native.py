@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from rf3dgs.core.errors import MissingDependencyError
 from rf3dgs.core.grids import Camera, Panorama, View
-from rf3dgs.splats.backends.core import native_core, native_failure, thread_count
+from rf3dgs.core.native import native_core, native_failure, thread_count
 from rf3dgs.splats.projection import project_sphere
 from rf3dgs.splats.raster import Raster
 
