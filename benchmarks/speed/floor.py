@@ -13,7 +13,7 @@ import os
 import sys
 from dataclasses import dataclass
 
-from rf3dgs.splats.backends.core import native_core, thread_count
+from rf3dgs.core.native import native_core, thread_count
 
 LANES = 16
 FLOAT = 4  # bytes

@@ -105,7 +105,7 @@ def _frames(path: Path) -> Iterator[NDArray[np.uint8]]:
             if not good:
                 break
             number += 1
-            yield np.ascontiguousarray(picture[..., ::-1])
+            yield np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
         if number < WHOLE * promised:
             raise DataError(
                 f"{path}: the video is damaged after {number} of {promised:.0f} frames; copy or export it again"

@@ -34,7 +34,8 @@ class Preset:
     def applied(self, scene: Scene, config: TraceConfig | None = None) -> tuple[Scene, TraceConfig]:
         """The scene and the configuration under this preset; what the configuration says otherwise stays.
 
-        Raises InputError when the configuration names another frequency or changes a whole set, or a material is not defined at this one.
+        Raises InputError when the configuration names another frequency or changes a whole set, or when a material is
+        not defined at this frequency.
         """
         config = TraceConfig() if config is None else config
         if self.min_paths and config != TraceConfig(seed=config.seed, frequency=config.frequency):
