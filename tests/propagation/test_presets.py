@@ -40,11 +40,19 @@ def stage(*objects, frequency=10e9):
 @pytest.mark.parametrize("name", list(PRESETS))
 def test_every_preset_gives_the_lobby_materials_at_its_frequency(name):
     preset = preset_of(name)
-    scene, config = preset.applied(lobby("full", people=1), TraceConfig(rays=123))
+    scene, config = preset.applied(lobby("full", people=1), TraceConfig(seed=123))
     scene.check_radio(preset.frequency)
     assert scene.frequency == config.frequency == preset.frequency
-    assert config.rays == 123
+    assert config.seed == 123
     assert (config.refraction, config.diffraction) == (preset.refraction, preset.diffraction)
+
+
+def test_other_settings_stay_unless_the_preset_is_a_whole_set(site):
+    wish = TraceConfig(rays=123, passes=2)
+    config = preset_of("diffuse").applied(site, wish)[1]
+    assert (config.rays, config.passes) == (123, 2)
+    with pytest.raises(InputError, match="the preset 'paper' is a whole set and says how paths are traced"):
+        preset_of("paper").applied(site, wish)
 
 
 def test_the_diffuse_preset_scatters_nearly_everything_by_lamberts_law(site):
@@ -109,7 +117,7 @@ def test_impossible_materials_are_refused(site, change, message):
 
 
 def test_unknown_presets_and_contradicting_frequencies_are_refused(site):
-    with pytest.raises(InputError, match="no preset is named '60ghz'; use one of diffuse, realistic, 28ghz"):
+    with pytest.raises(InputError, match="no preset is named '60ghz'; use one of paper, diffuse, realistic, 28ghz"):
         preset_of("60ghz")
     with pytest.raises(InputError, match="made for 28 GHz; got the frequency 60 GHz"):
         preset_of("28ghz").applied(site, TraceConfig(frequency=60e9))

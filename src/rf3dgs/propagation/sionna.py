@@ -75,6 +75,8 @@ def trace_each(
     scene = scene if isinstance(scene, Scene) else scene_of(scene)
     tx = scene.tx if tx is None else tx
     frequency = frequency or config.frequency or scene.frequency
+    if tx.batch_shape or len(rx.batch_shape) != 1:
+        raise InputError(f"tx must be one pose and rx a list [rx]; got {tx.batch_shape} and {rx.batch_shape}")
     numbers = list(range(len(rx)) if indices is None else indices)
     _check(scene, tx, rx, config, frequency, numbers)
     return _trace_each(scene, tx, rx, config, progress, frequency, numbers, tracer)
@@ -230,8 +232,6 @@ def _paths(columns: list[NDArray], frequency: float, tx: Pose, rx: Pose) -> Path
 
 def _check(scene: Scene, tx: Pose, rx: Pose, config: TraceConfig, frequency: float, numbers: Sequence[int]) -> None:
     """Refuse what cannot be traced, naming the receiver and what is in its way."""
-    if tx.batch_shape or len(rx.batch_shape) != 1:
-        raise InputError(f"tx must be one pose and rx a list [rx]; got {tx.batch_shape} and {rx.batch_shape}")
     if config.rays < 1 or config.passes < 1 or config.depth < 0:
         raise InputError(
             f"rays and passes must be positive and depth not negative; "
