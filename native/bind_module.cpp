@@ -168,7 +168,7 @@ NB_MODULE(_native, m) {
         result["BLUR"] = kBlur;
         result["NEAR"] = kNear;
         result["FIELD_CLAMP"] = kFieldClamp;
-        result["HALF_TRANSMITTANCE"] = kHalfTransmittance;
+        result["GATE_TRANSMITTANCE"] = kGateTransmittance;
         result["SPHERE_FIELD"] = kSphereField;
         result["SSIM_RADIUS"] = kSsimRadius;
         result["SSIM_SIGMA"] = kSsimSigma;

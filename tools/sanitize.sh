@@ -6,6 +6,7 @@ cd "$(dirname "$0")/.."
 rounds="${1:-200}"
 out="${OUT:-out/sanitize}"
 python="$(command -v "${PYTHON:-python3}")"
+python="$(cd "$(dirname "$python")" && pwd)/$(basename "$python")"
 cmake=cmake
 if ! command -v cmake >/dev/null; then
     "$python" -m pip install -q --disable-pip-version-check cmake

@@ -11,7 +11,7 @@ constexpr float kAlphaMin = 1.0f / 255.0f;    // weaker contributions to a pixel
 constexpr float kLog2AlphaMin = -7.994353436858858f;
 constexpr float kTransmittanceStop = 1e-4f;   // a pixel stops before the contribution that would bring it below
 constexpr float kFieldClamp = 1.3f;           // the Jacobian's x/z and y/z stay within this many half-fields
-constexpr float kHalfTransmittance = 0.5f;    // the gate counts from the Gaussian that brings a pixel below this
+constexpr float kGateTransmittance = 0.75f;   // the gate counts from the Gaussian that brings a pixel below this
 constexpr float kSphereField = 0.2f;          // the sphere shows a Gaussian where the angle's cosine exceeds this
 constexpr float kMinQuaternionNorm = 1e-12f;  // shorter quaternions have no direction
 

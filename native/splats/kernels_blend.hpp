@@ -66,8 +66,8 @@ RF_INLINE Step<Shape> advance(const typename Shape::Splat& splat, const typename
   step.weight = keep(step.counts, weight);
   light.through = choose(step.counts, after, light.through);
   if constexpr (kGate) {
-    const Mask takes_half = both(step.counts, below(after, splat_vec(kHalfTransmittance)));
-    light.limit = min_vec(choose(takes_half, splat_vec(splat.depth + gate), light.limit), light.limit);
+    const Mask sets_gate = both(step.counts, below(after, splat_vec(kGateTransmittance)));
+    light.limit = min_vec(choose(sets_gate, splat_vec(splat.depth + gate), light.limit), light.limit);
   }
   light.product = after;
   return step;

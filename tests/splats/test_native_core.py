@@ -9,7 +9,7 @@ from torch import Tensor
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, pinhole_grid
 from rf3dgs.core.native import native_core
-from rf3dgs.splats.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
+from rf3dgs.splats.constants import ALPHA_MAX, ALPHA_MIN, GATE_TRANSMITTANCE, TRANSMITTANCE_STOP
 from rf3dgs.splats.projection import project
 
 POSE = Pose.look_at(position=(-3.0, 0.5, 0.3), target=(0.0, 0.0, 0.0))
@@ -85,8 +85,8 @@ def weights_one_by_one(tensors: list[Tensor], gate: float | None) -> tuple[Tenso
         counts = (after >= TRANSMITTANCE_STOP) & (depth[index] <= limit)
         weights.append(torch.where(counts, product * alpha, 0.0))
         if gate is not None:
-            takes_half = counts & (after < 0.5) & torch.isinf(limit)
-            limit = torch.where(takes_half, depth[index] + gate, limit).detach()
+            sets_gate = counts & (after < GATE_TRANSMITTANCE) & torch.isinf(limit)
+            limit = torch.where(sets_gate, depth[index] + gate, limit).detach()
         product = after
     return torch.stack(weights), torch.tensor(order)
 
@@ -141,7 +141,7 @@ def test_largest_weights_are_running_maxima_over_pixels_and_pictures(gate: float
 
 
 @pytest.mark.parametrize(("gate", "channels"), [(0.0, 3), (0.3, 1), (1.0, 3)])
-def test_nothing_counts_further_behind_the_half_depth_than_the_gate(gate: float, channels: int):
+def test_nothing_counts_further_behind_the_surface_than_the_gate(gate: float, channels: int):
     tensors = cloud(300, channels, seed=2)
     tensors[3] = 0.2 + 0.5 * tensors[3]
     leaves = [tensor.double().requires_grad_() for tensor in tensors]

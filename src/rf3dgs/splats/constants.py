@@ -6,7 +6,7 @@ TRANSMITTANCE_STOP = 1e-4  # a pixel stops before the contribution that would br
 BLUR = 0.3  # added to both variances of a projected Gaussian [pixel^2]
 NEAR = 0.05  # Gaussians nearer than this view depth are not drawn [m]
 FIELD_CLAMP = 1.3  # the Jacobian's x/z and y/z stay within this many half-fields from the principal point
-HALF_TRANSMITTANCE = 0.5  # the depth gate counts from the Gaussian that brings a pixel below this
+GATE_TRANSMITTANCE = 0.75  # the depth gate counts from the Gaussian that brings a pixel below this
 SPHERE_FIELD = 0.2  # a panorama shows a Gaussian where the cosine of the angle to its centre exceeds this
 
 SSIM_RADIUS = 5  # the window of the structural similarity is 11x11 pixels

@@ -14,7 +14,7 @@ from rf3dgs.core.grids import Camera, Panorama, View
 from rf3dgs.splats.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
-    HALF_TRANSMITTANCE,
+    GATE_TRANSMITTANCE,
     NEAR,
     SPHERE_FIELD,
     TRANSMITTANCE_STOP,
@@ -144,6 +144,6 @@ def _drawn(
 def _last_depth(alpha: Tensor, depth: Tensor) -> Tensor:
     """Depth `[pixel]` of the Gaussian that brings the transmittance below a half; infinite where none does."""
     with torch.no_grad():
-        below = torch.cumprod(1 - alpha, 0) < HALF_TRANSMITTANCE
+        below = torch.cumprod(1 - alpha, 0) < GATE_TRANSMITTANCE
         first = depth[below.to(torch.uint8).argmax(0)]
         return torch.where(below[-1], first, torch.inf)
