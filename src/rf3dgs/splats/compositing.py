@@ -21,8 +21,8 @@ class Compositing:
     """What is done to channels besides blending them front to back.
 
     depth_gate [m]: a contribution to a pixel counts only if its Gaussian is at most this much deeper than the one that
-        brought the pixel's transmittance below three quarters; None for all. It stops what shines through gaps of a surface.
-        Depth is what the Gaussians are sorted by: view z of a camera, distance of a panorama.
+        brought the pixel's transmittance below three quarters; None for all. It stops what shines through gaps of a
+        surface. Depth is what the Gaussians are sorted by: view z of a camera, distance of a panorama.
     normalise: channels are divided by the accumulated weight; they are zero where the weight is.
     transfer: one for all channels or one for each: "identity", or "db_window" for linear power to be shown in the
         window from floor_db (0) to ceil_db (1), see `db_window`.
