@@ -125,8 +125,8 @@ def share(condition: Tensor) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--receivers", type=int, default=8)
-    parser.add_argument("--lamps", type=int, default=32)
+    parser.add_argument("--receivers", type=int, default=20)
+    parser.add_argument("--lamps", type=int, default=80)
     parser.add_argument("--count", type=int, default=100_000, help="Gaussians on the mesh")
     wish = parser.parse_args()
     scene, grid = lobby(), equirect_grid(240, 120)
