@@ -1,6 +1,7 @@
 """The command line as a person meets it: help, errors in one sentence, answers from the shipped field."""
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -193,3 +194,12 @@ def test_a_preset_and_settings_of_the_radio_stage_do_not_mix(
     out = ("--out", str(tmp_path / "field"))
     assert main(["fit-radio", "nowhere.ply", "lobby", *out, "--preset", "fast", "--radio.steps", "3"]) == 2
     assert "--preset fast sets all of the radio stage; give it or --radio.*, not both" in capsys.readouterr().err
+
+
+def test_help_into_a_closed_pipe_ends_quietly():
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as closed:
+        run = subprocess.run([sys.executable, "-m", "rf3dgs", "trace", "--help"], stdout=closed, stderr=-1, check=False)
+    assert run.returncode == 0
+    assert run.stderr == b""

@@ -60,14 +60,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         complain(f"RF3DGS_LOG must be DEBUG, INFO, WARNING or ERROR; got {level!r}")
         return 2
     logging.basicConfig(level=level, format="%(name)s: %(message)s")
-    command = tyro.cli(
-        Command,  # type: ignore[arg-type]
-        prog="rf3dgs",
-        description=ABOUT,
-        args=arguments,
-        config=(tyro.conf.ConsolidateSubcommandArgs,),
-    )
     try:
+        command = tyro.cli(
+            Command,  # type: ignore[arg-type]
+            prog="rf3dgs",
+            description=ABOUT,
+            args=arguments,
+            config=(tyro.conf.ConsolidateSubcommandArgs,),
+        )
         return command.run()
     except RfError as error:
         complain(str(error))
