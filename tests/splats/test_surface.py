@@ -4,7 +4,9 @@ import pytest
 import torch
 
 from rf3dgs.core.errors import InputError
-from rf3dgs.core.frames import matrix_from_quaternion
+from rf3dgs.core.frames import Pose, matrix_from_quaternion
+from rf3dgs.core.grids import equirect_grid, view_of
+from rf3dgs.splats.draw import draw
 from rf3dgs.splats.surface import normals, sample_mesh
 from rf3dgs.splats.transmittance import segment_transmittance
 
@@ -143,3 +145,22 @@ def test_wrong_input_is_explained() -> None:
         sample_mesh(vertices, faces, count=0)
     with pytest.raises(InputError, match=r"colours must be \[face, channel\] for 2 faces"):
         sample_mesh(vertices, faces, count=10, colours=torch.zeros(3, 3))
+
+
+def test_normals_are_composited_beside_depth_in_one_pass() -> None:
+    """Seen from inside a box, the normal in each direction is that of the wall there, and the depth its distance."""
+    size = torch.tensor([4.0, 3.0, 2.5])
+    gaussians = sample_mesh(*box(*size.tolist()), spacing=0.05)
+    grid = equirect_grid(120, 60)
+    pose = Pose(size / 2)
+    raster = draw(gaussians, view_of(pose, grid), extra=normals(gaussians), depth=True)
+    found = raster.values / raster.weight[..., None]
+    directions = grid.directions
+    reach = (size / 2) / directions.abs()
+    axis = reach.argmin(-1)
+    clear = reach.sort(-1).values.diff(dim=-1)[..., 0] > 0.4  # away from the edges between walls
+    expected = torch.nn.functional.one_hot(axis, 3) * directions.sign()  # outwards
+    normal = torch.nn.functional.normalize(found[..., -4:-1], dim=-1)
+    assert float((normal * expected).sum(-1)[clear].min()) > 0.999
+    # The depth is that of the Gaussians' centres, which a flat view spreads over the pixel of three degrees.
+    assert float((found[..., -1] - reach.amin(-1))[clear].abs().mean()) < 0.02
