@@ -9,7 +9,7 @@
 //
 // The product of all (1 - alpha) so far only falls: a splat counts while the product including it is not below the stop,
 // so a pixel that has stopped needs no mark. With a gate, a splat counts while it lies no further than the gate behind
-// the one that took the product below one half; the list is sorted, so such a pixel has stopped as well.
+// the one that took the product below three quarters; the list is sorted, so such a pixel has stopped as well.
 //
 // A shape is a struct with
 //   Splat                                       what is drawn: plain floats, `depth` among them
