@@ -13,6 +13,7 @@ import torch
 import rf3dgs
 from rf3dgs.core.units import db_from_power
 from rf3dgs.propagation import Slab, shoebox
+from rf3dgs.spectra import ArrayProcessing
 
 # Six walls, in the order x low, x high, y low, y high, z low, z high: materials by name, one window, a metal ceiling.
 walls = ["plasterboard", "concrete", "plasterboard", Slab(permittivity=6.3, conductivity=0.9, thickness=0.006)]
@@ -29,7 +30,8 @@ for gain_db, delay, order in zip(db_from_power(best.path_gain), best.delay, best
 # The paths go wherever traced paths go: here the picture of an 8 x 8 array that looks at the transmitter.
 grid = rf3dgs.pinhole_grid(120, 80, fov_deg=90)
 array = rf3dgs.planar_array(8, 8, pattern="patch")
-picture = rf3dgs.spectrum_of(paths[0], array, grid, method="capon", snapshots=None, snr_db=30.0)
+uncorrelated = ArrayProcessing(snapshots=None, snr_db=30.0)
+picture = rf3dgs.spectrum_of(paths[0], array, grid, method="capon", processing=uncorrelated)
 row, col = divmod(int(picture.power.argmax()), grid.width)
 off = math.degrees(float(torch.acos(grid.directions[row, col, 0].clamp(-1, 1))))
 print(f"the array's main peak is {off:.1f} degrees off the line of sight")

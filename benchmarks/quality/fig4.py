@@ -12,7 +12,6 @@ import argparse
 import io
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +31,8 @@ from rf3dgs.propagation.lobby import lobby
 from rf3dgs.propagation.sionna import trace_each
 from rf3dgs.spectra.beamformers import hann_taper
 from rf3dgs.spectra.codec import DbWindow, PerViewLinear, paper_scale
-from rf3dgs.spectra.scan import Method, spectrum_of
+from rf3dgs.spectra.config import ArrayProcessing, Method
+from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Spectrum
 
 METHODS: dict[Method, str] = {
@@ -72,10 +72,12 @@ def spectra(paths: Paths, pose: Pose, array: PlanarArray, grid: DirectionGrid, s
     """The five spectra of one position, from 256 frequencies over 2 GHz."""
     found = {}
     for method in METHODS:
-        sounding: dict[str, Any] = {} if method == "ideal" else {"array": array, "snr_db": snr_db}
-        if method == "music":
-            sounding["sources"] = array.count // SHARE
-        found[method] = spectrum_of(paths, grid=grid, method=method, pose=pose, **sounding)
+        if method == "ideal":
+            found[method] = spectrum_of(paths, grid=grid, pose=pose)
+            continue
+        sources = array.count // SHARE if method == "music" else None
+        how = ArrayProcessing(snr_db=snr_db, sources=sources)
+        found[method] = spectrum_of(paths, array, grid, method=method, processing=how, pose=pose)
     return found
 
 

@@ -29,6 +29,7 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid, pinhole_grid
 from rf3dgs.core.native import thread_count
 from rf3dgs.spectra.beamformers import bartlett, capon, music
+from rf3dgs.spectra.config import ArrayProcessing
 from rf3dgs.spectra.covariance import covariance_of
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.steering import PlanarSteering
@@ -98,7 +99,7 @@ def time_all(seconds: float, count: int) -> list[Row]:
     for label, snapshots, must in (("256 frequencies", 256, 2000.0), ("uncorrelated paths", None, None)):
 
         def picture(_: int, snapshots: int | None = snapshots) -> object:
-            return spectrum_of(paths, array, grid, method="capon", snapshots=snapshots)
+            return spectrum_of(paths, array, grid, method="capon", processing=ArrayProcessing(snapshots=snapshots))
 
         rows.append(Row(f"Capon picture 300x200, {label}", measure(picture, 1, seconds), clock_must=must))
     R = covariance_of(paths, array, snr_db=20)

@@ -138,6 +138,9 @@ def test_imports_that_cannot_be_leave_nothing(source, tmp_path, capsys):
     assert "is the source itself" in refused(capsys, "import", source, "--out", source)
     assert "--pair is for DeepMIMO folders" in refused(capsys, "import", source, "--out", target, "--pair", "x")
     assert "--count is for measured soundings" in refused(capsys, "import", source, "--out", target, "--count", "3")
+    assert "--untold is for measured soundings" in refused(
+        capsys, "import", source, "--out", target, "--untold", "ahead"
+    )
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -172,3 +175,24 @@ def test_a_measurement_becomes_paths_through_sage(tmp_path, suffix):
     assert found.count.tolist() == [1]
     assert float(found.delay[0, 0] - paths.delay[0, 0]) == pytest.approx(0, abs=0.01 / 320e6)
     assert float(found.total_gain[0] / paths.total_gain[0]) == pytest.approx(1, abs=0.02)
+
+
+def test_a_row_of_elements_is_refused_until_what_it_cannot_tell_is_taken_as_ahead(tmp_path, capsys):
+    from rf3dgs.channel.arrays import planar_array
+    from rf3dgs.channel.response import cfr
+    from rf3dgs.channel.sounding import Sounding
+    from rf3dgs.propagation.measured import write_sounding
+
+    row = planar_array(1, 6, "isotropic")
+    rx = Pose.look_at([[4.0, 3.2, TX.position[2]]], TX.position)
+    paths = shoebox(SIZE, TX, rx, FREQUENCY, 0)
+    offsets = (torch.arange(16, dtype=torch.float64) - 8) * 20e6
+    response = cfr(paths, row, None, offsets).to(torch.complex128)
+    write_sounding(tmp_path / "row.h5", Sounding(response, offsets, FREQUENCY, TX, rx, array_rx=row))
+    target = tmp_path / "found.paths"
+    assert "zenith" in refused(capsys, "import", tmp_path / "row.h5", "--count", "1", "--out", target)
+    assert not target.exists()
+    run("import", tmp_path / "row.h5", "--count", "1", "--untold", "ahead", "--out", target)
+    found = load_paths(target)
+    assert float(found.aoa_zenith[0, 0]) == pytest.approx(np.pi / 2, abs=1e-6)
+    assert float(found.aoa_azimuth[0, 0] - paths.aoa_azimuth[0, 0]) == pytest.approx(0, abs=1e-3)

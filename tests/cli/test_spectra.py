@@ -1,5 +1,6 @@
 """`rf3dgs spectra`: receiver by receiver, in flat memory, going on where it was killed; and the paper's protocol."""
 
+import math
 import os
 import signal
 import subprocess
@@ -11,12 +12,14 @@ from pathlib import Path
 import pytest
 import torch
 
+from rf3dgs.channel.arrays import planar_array
 from rf3dgs.channel.io import PathsReader, PathsWriter
 from rf3dgs.cli.main import main
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import equirect_grid
+from rf3dgs.core.grids import equirect_grid, pinhole_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.data.dataset import Dataset
+from rf3dgs.spectra.config import ArrayProcessing, Loading
 from rf3dgs.spectra.scan import spectrum_of
 
 ROOM = ((0, 0, 1), (14, 15, 2))
@@ -158,4 +161,81 @@ def test_a_preset_and_what_it_sets_are_not_both_given(write_paths, tmp_path, cap
     command = ["spectra", str(write_paths(10)), "--out", str(tmp_path / "site"), "--preset", "paper"]
     assert main([*command, "--fov-deg", "60"]) == 2
     assert "--preset paper sets --fov-deg as well; give one of the two" in capsys.readouterr().err
+    assert not (tmp_path / "site").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "how"),
+    [
+        (
+            "--method mvdr --snapshots 40 --bandwidth 1e9 --taps 0 1e-8 --snr-db 15 --averaging forward-backward "
+            "--subarray 3 2 --loading.amount 25 --loading.rule snr",
+            ArrayProcessing(40, 1e9, (0.0, 1e-8), 15.0, "forward-backward", (3, 2), Loading(25.0, "snr")),
+        ),
+        ("--method music --snr-db 20 --sources 3", ArrayProcessing(snr_db=20.0, sources=3)),
+        ("--method music --snr-db 20 --sources aic", ArrayProcessing(snr_db=20.0, sources="aic")),
+        ("--method cbf --snapshots None", ArrayProcessing(snapshots=None)),
+    ],
+)
+def test_the_options_of_arrays_are_the_fields_of_their_processing(write_paths, tmp_path, options, how):
+    file, out = write_paths(10), tmp_path / "site"
+    view = ["--array", "4x4", "--pattern", "isotropic", "--grid", "pinhole", "--size", "24", "16", "--seed", "5"]
+    assert main(["spectra", str(file), "--out", str(out), *view, *options.split()]) == 0
+    stored = Dataset.load(out, unseal_test=True).spectra
+    method = options.split()[1]
+    with PathsReader(file) as reader:
+        alone = spectrum_of(
+            reader[7],
+            planar_array(4, 4, "isotropic"),
+            pinhole_grid(24, 16, 90),
+            method=method,
+            processing=how,
+            seed=12,
+        )
+    assert float((stored[7].gain_db - alone.gain_db).abs().max()) < 0.00251, "half a step"
+    assert stored.instrument.name == alone.instrument.name
+    assert main(["validate", str(out)]) == 0
+
+
+def test_fields_are_not_made_of_spectra_without_level(write_paths, tmp_path, capsys):
+    out = tmp_path / "site"
+    options = ["--method", "music", "--array", "4x4", "--sources", "3", "--snr-db", "20", "--size", "24", "12"]
+    assert main(["spectra", str(write_paths(10)), "--out", str(out), *options]) == 0
+    assert main(["fit", str(out), "--mesh", "lobby", "--out", str(tmp_path / "site.field")]) == 2
+    assert "have no level to learn; make spectra of power" in capsys.readouterr().err
+
+
+def test_the_ideal_lobe_is_as_wide_as_asked(write_paths, tmp_path):
+    out = tmp_path / "site"
+    assert main(["spectra", str(write_paths(10)), "--out", str(out), "--size", "24", "12", "--lobe-deg", "40"]) == 0
+    lobe = Dataset.load(out, unseal_test=True).spectra.instrument.lobe
+    assert lobe == pytest.approx(math.radians(40), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--snr-db 20", "an ideal spectrum has no array to process"),
+        ("--method cbf --lobe-deg 3", 'lobe belongs to method "ideal"'),
+        ("--method cbf --loading.amount 0.1", 'loading belongs to method "capon"'),
+        ("--method mvdr --sources 2", 'sources belong to method "music"'),
+        ("--method music --snapshots 64", "more snapshots than the 64 elements; got 64"),
+        ("--method mvdr --subarray 9 2", "1 to 8 rows and 1 to 8 columns of the 8x8 patch array; got 9x2"),
+    ],
+)
+def test_options_that_cannot_be_are_told_before_the_paths_are_read(write_paths, tmp_path, capsys, options, message):
+    out = tmp_path / "site"
+    assert main(["spectra", str(write_paths(10)), "--out", str(out), *options.split()]) == 2
+    told = capsys.readouterr().err
+    assert message in told
+    assert "reading paths" not in told
+    assert [item.name for item in tmp_path.iterdir()] == ["10-30.paths"]
+
+
+def test_values_that_no_field_can_have_are_told_with_the_usage(write_paths, tmp_path, capsys):
+    command = ["spectra", str(write_paths(10)), "--out", str(tmp_path / "site"), "--method", "mvdr"]
+    with pytest.raises(SystemExit, match="2"):
+        main([*command, "--loading.amount", "-1"])
+    told = " ".join(capsys.readouterr().err.split())
+    assert "a relative loading must be finite and, as a power, not negative; got -1.0" in told
     assert not (tmp_path / "site").exists()

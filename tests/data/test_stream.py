@@ -10,6 +10,7 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid, pinhole_grid
 from rf3dgs.core.progress import Silent
 from rf3dgs.data import stream
+from rf3dgs.spectra.config import ArrayProcessing
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.yaws import at_yaws
 
@@ -57,7 +58,9 @@ def test_array_spectra_without_delays_are_streamed_too(receivers, tmp_path):
     grid = pinhole_grid(12, 8, 90)
 
     def spectra_at(number, paths):
-        return spectrum_of(paths, planar_array(2, 2), grid, method="bartlett", snapshots=None)
+        return spectrum_of(
+            paths, planar_array(2, 2), grid, method="bartlett", processing=ArrayProcessing(snapshots=None)
+        )
 
     stored = stream.stream_spectra(receivers, spectra_at, tmp_path / "run", settings={}, meta={}, progress=Silent())
     assert stored.delay is None

@@ -11,6 +11,7 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid, list_grid, pinhole_grid
 from rf3dgs.spectra.beamformers import bartlett, capon, hann_taper, tapered
+from rf3dgs.spectra.config import ArrayProcessing, Loading
 from rf3dgs.spectra.covariance import covariance_of, covariance_of_spectrum
 from rf3dgs.spectra.scan import array_instrument, spectrum_of
 
@@ -55,7 +56,7 @@ def test_a_unit_path_peaks_at_one(paths_from):
 
 @pytest.mark.parametrize("array", [ISOTROPIC, PATCH, planar_array(4, 4, "tr38901")], ids=lambda a: a.pattern)
 def test_capon_of_white_noise_is_flat(array):
-    power = capon(3.0 * torch.eye(array.count), manifold(array, GRID.directions), loading=0.0)
+    power = capon(3.0 * torch.eye(array.count), manifold(array, GRID.directions), Loading(0.0))
     assert torch.allclose(power, torch.full_like(power, 3.0 / array.count))
 
 
@@ -64,7 +65,7 @@ def test_capon_is_the_papers_formula(random_paths):
     array = planar_array(4, 4, "isotropic")
     A = manifold(array, GRID.directions.double()).reshape(-1, 16)
     expected = 1.0 / (A.conj() * (torch.linalg.inv(R) @ A.mT).mT).sum(-1).real
-    assert torch.allclose(capon(R, A, loading=0.0), expected)
+    assert torch.allclose(capon(R, A, Loading(0.0)), expected)
 
 
 def test_capon_resolves_two_sources_that_bartlett_does_not(paths_from):
@@ -113,7 +114,8 @@ def test_turning_the_world_turns_the_array_spectrum(random_paths):
     yaw = 1.1
     turned = paths._map(lambda value: value.clone(), rx=paths.rx.turned(yaw))
     turned.aoa_azimuth.add_(yaw)
-    first, second = (spectrum_of(p, PATCH, GRID, method="capon", snapshots=None).gain_db for p in (paths, turned))
+    how = ArrayProcessing(snapshots=None)
+    first, second = (spectrum_of(p, PATCH, GRID, method="capon", processing=how).gain_db for p in (paths, turned))
     assert torch.allclose(first, second, atol=0.01)
 
 
@@ -126,7 +128,7 @@ def test_capon_is_stable_at_a_condition_of_1e11():
     overlap = (A.conj() @ source).abs().square()
     expected = noise / (count - overlap / (noise + count))
     assert float(torch.linalg.cond(R)) > 5e10
-    power = capon(R, A, loading=0.0)
+    power = capon(R, A, Loading(0.0))
     assert torch.allclose(10 * torch.log10(power), 10 * torch.log10(expected), atol=0.05)
 
 
@@ -190,7 +192,10 @@ def test_a_patch_sees_nothing_behind_itself(paths_from):
         ({"method": "bartlett"}, "needs an array"),
         ({"array": PATCH, "method": "esprit"}, "method must be one of ideal, bartlett, tapered, capon, music"),
         ({"array": PATCH, "method": "capon", "lobe": 0.1}, "lobe belongs to"),
-        ({"array": PATCH, "method": "capon", "snapshots": 0}, "snapshots must be at least 1"),
+        (
+            {"array": PATCH, "method": "capon", "processing": ArrayProcessing(snapshots=0)},
+            "snapshots must be at least 1",
+        ),
         ({"array": PATCH, "grid": None}, "needs a grid"),
     ],
 )
@@ -201,8 +206,10 @@ def test_wrong_arguments_are_told(random_paths, arguments, message):
 
 def test_a_singular_covariance_without_loading_is_refused(paths_from):
     R = covariance_of(paths_from([1.0, 0.0, 0.0]), PATCH)
-    with pytest.raises(InputError, match="larger one, such as 1e-3"):
-        capon(R, manifold(PATCH, GRID.directions), loading=0.0)
+    with pytest.raises(
+        InputError, match=r"with Loading\(amount=0.0, rule='relative'\); use a larger one, such as Loading\(1e-3\)"
+    ):
+        capon(R, manifold(PATCH, GRID.directions), Loading(0.0))
     with pytest.raises(InputError, match="R must be"):
         bartlett(R[:3], manifold(PATCH, GRID.directions))
     with pytest.raises(InputError, match="NaN or infinite"):

@@ -11,6 +11,7 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid, list_grid, pinhole_grid
 from rf3dgs.core.units import db_from_power
+from rf3dgs.spectra.config import ArrayProcessing
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.synthesis import default_lobe
 
@@ -170,9 +171,9 @@ def test_a_lobe_too_narrow_for_the_grid_is_refused(random_paths):
     assert spectrum_of(random_paths(1), grid=SPHERE, lobe=math.radians(2.8)).instrument.lobe < math.radians(2.9)
 
 
-def test_noise_needs_an_array(random_paths):
-    with pytest.raises(InputError, match='method="bartlett"'):
-        spectrum_of(random_paths(1), grid=SPHERE, snr_db=20)
+def test_an_ideal_spectrum_has_no_array_to_process(random_paths):
+    with pytest.raises(InputError, match='no array to process; use processing with method="bartlett"'):
+        spectrum_of(random_paths(1), grid=SPHERE, processing=ArrayProcessing(snr_db=20))
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from rf3dgs.channel.response import coefficients
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.native import native_core
 from rf3dgs.spectra import responses as module
+from rf3dgs.spectra.config import ArrayProcessing
 from rf3dgs.spectra.covariance import covariance_of, covariance_of_snapshots, delay_taps
 from rf3dgs.spectra.deposit import deposit, deposited, values_of
 from rf3dgs.spectra.responses import FEW, kernel, kernel_polynomials, kernel_transform, responses
@@ -103,7 +104,9 @@ def test_taps_show_one_reflection_without_the_others(paths_from):
     directions = torch.nn.functional.normalize(torch.tensor([[1.0, 0.5, 0.0], [1.0, -0.4, 0.2]]), dim=-1)
     paths = paths_from(directions, gains=[1.0, 0.01], delays=[20e-9, 35e-9])
     grid = pinhole_grid(41, 27, 90)
-    power = spectrum_of(paths, planar_array(8, 8), grid, method="bartlett", taps=(30e-9, 40e-9)).power
+    power = spectrum_of(
+        paths, planar_array(8, 8), grid, method="bartlett", processing=ArrayProcessing(taps=(30e-9, 40e-9))
+    ).power
     peak = grid.directions.reshape(-1, 3)[power.argmax()]
     assert float(angle_between(peak, directions[1])) < grid.spacing
 

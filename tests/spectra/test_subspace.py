@@ -1,6 +1,7 @@
 """MUSIC, the number of sources, averaging and loading: what they are known to do."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,9 +11,10 @@ from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import list_grid, pinhole_grid
 from rf3dgs.spectra.beamformers import capon, music
+from rf3dgs.spectra.config import ArrayProcessing, Loading
 from rf3dgs.spectra.covariance import covariance_of
 from rf3dgs.spectra.decorrelation import forward_backward, smoothed
-from rf3dgs.spectra.loading import Loading, loaded
+from rf3dgs.spectra.loading import loaded
 from rf3dgs.spectra.order import source_count
 from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.scan import array_instrument, spectrum_of
@@ -21,6 +23,7 @@ from rf3dgs.spectra.steering import PlanarSteering
 ARRAY = planar_array(8, 8, "isotropic")
 LINE = planar_array(1, 10, "isotropic")
 GRID = pinhole_grid(61, 41, 90)
+NOISY = ArrayProcessing(snr_db=20)
 
 
 def _in_azimuth(*degrees):
@@ -44,7 +47,7 @@ def test_music_resolves_what_bartlett_does_not(paths_from):
     paths = paths_from(_in_azimuth(2.0, -2.0), delays=[3e-8, 4.4e-8])
     cut = _cut(-10, 10, 201)
     shown = {
-        method: _dip_db(spectrum_of(paths, LINE, cut, method=method, snr_db=20).power[0])
+        method: _dip_db(spectrum_of(paths, LINE, cut, method=method, processing=NOISY).power[0])
         for method in ("bartlett", "music")
     }
     assert shown["bartlett"] < 0.1
@@ -54,7 +57,8 @@ def test_music_resolves_what_bartlett_does_not(paths_from):
 def test_music_finds_as_many_directions_as_there_are_sources(paths_from):
     directions = _in_azimuth(-25.0, -4.0, 12.0, 31.0)
     paths = paths_from(directions, gains=[1.0, 0.3, 0.1, 0.5], delays=[2e-8, 3.1e-8, 4.3e-8, 6.2e-8])
-    spectrum = spectrum_of(paths, ARRAY, GRID, method="music", snr_db=20, sources="mdl")
+    counted = ArrayProcessing(snr_db=20, sources="mdl")
+    spectrum = spectrum_of(paths, ARRAY, GRID, method="music", processing=counted)
     found, _ = find_peaks(spectrum.power[:, :], GRID, count=4, separation=math.radians(6))
     nearest = angle_between(directions[:, None].expand(4, 4, 3), found[None].expand(4, 4, 3)).min(1).values
     assert float(nearest.rad2deg().max()) < 1.0
@@ -72,6 +76,18 @@ def test_mdl_counts_independent_sources_and_none_in_noise(paths_from):
         )
         R = covariance_of(paths, ARRAY, snapshots=256, snr_db=10)
         assert int(source_count(R, 256)) == count
+
+
+def test_the_delay_taps_that_are_kept_are_the_snapshots(random_paths):
+    """41 taps of 0.5 ns in 20 ns: sources are counted from 41 snapshots, not from 256, which would find more."""
+    paths, array, window = random_paths(300), planar_array(4, 4), (2e-8, 4e-8)
+    spectrum = spectrum_of(
+        paths, array, GRID, method="music", processing=ArrayProcessing(taps=window, snr_db=10, sources="aic")
+    )
+    R = covariance_of(paths, array, snapshots=256, taps=window, snr_db=10)
+    count = int(source_count(R, 41, "aic"))
+    assert count < int(source_count(R, 256, "aic"))
+    assert torch.equal(spectrum.power, music(R, PlanarSteering(array, GRID.directions), count).float())
 
 
 def test_aic_never_finds_fewer_than_mdl(random_paths):
@@ -94,7 +110,8 @@ def test_coherent_sources_are_lost_without_smoothing_and_found_with_it(paths_fro
     smooth = music(averaged, PlanarSteering(part, cut.directions[0]), 2)
     assert float(plain[at].max()) < 1e3
     assert float(smooth[at].min()) > 1e6
-    spectrum = spectrum_of(paths, LINE, cut, method="music", snapshots=64, subarray=(1, 6), sources=2)
+    how = ArrayProcessing(snapshots=64, subarray=(1, 6), sources=2)
+    spectrum = spectrum_of(paths, LINE, cut, method="music", processing=how)
     assert torch.allclose(spectrum.power[0, at].log10(), smooth[at].log10().float(), atol=1.0)
     assert spectrum.instrument == array_instrument(part, "music")
 
@@ -131,7 +148,7 @@ def test_loading_rules_add_what_they_say(random_paths):
     R = covariance_of(random_paths(30), planar_array(3, 3)).expand(2, 9, 9) * torch.tensor([1.0, 4.0])[:, None, None]
     mean = R.diagonal(dim1=-2, dim2=-1).real.mean(-1)
     for rule, expected in (
-        (0.01, 0.01 * mean),
+        (Loading(), 0.001 * mean),
         (Loading(0.01), 0.01 * mean),
         (Loading(3e-9, "absolute"), torch.full_like(mean, 3e-9)),
         (Loading(20.0, "snr"), 0.01 * mean),
@@ -145,7 +162,7 @@ def test_absolute_loading_is_added_noise(random_paths):
     steering = PlanarSteering(array, GRID.directions)
     level = float(covariance_of(paths, array).diagonal().real.mean()) * 0.01
     loaded_clean = capon(covariance_of(paths, array), steering, Loading(level, "absolute"))
-    noisy = capon(covariance_of(paths, array, snr_db=20), steering, loading=0.0)
+    noisy = capon(covariance_of(paths, array, snr_db=20), steering, Loading(0.0))
     assert torch.allclose(loaded_clean, noisy, rtol=1e-6)
 
 
@@ -153,27 +170,31 @@ def test_more_loading_lets_capon_approach_bartlett(paths_from):
     """Without end the weights become those of the delay-and-sum beam; the picture is then flat at the loading / M."""
     paths = paths_from(_in_azimuth(5.0, -20.0), delays=[3e-8, 5e-8])
     R, steering = covariance_of(paths, LINE, snapshots=64), PlanarSteering(LINE, _cut(-60, 60, 121).directions[0])
-    power = capon(R, steering, loading=1e6)
+    power = capon(R, steering, Loading(1e6))
     assert torch.allclose(power, power.mean().expand_as(power), rtol=1e-4)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("method", "choices", "message"),
     [
-        ({"method": "capon", "sources": 2}, "sources belong to method \"music\"; 'capon'"),
-        ({"method": "music", "snapshots": None}, "to count sources takes snapshots"),
-        ({"method": "music", "snapshots": 64}, "more snapshots than the 64 elements; got 64"),
-        ({"method": "music", "sources": 64}, "between 0 and 63"),
-        ({"method": "music", "sources": "bic"}, "sources must be a number, .mdl. or .aic.; got .bic."),
-        ({"method": "capon", "averaging": "backward"}, "averaging must be one of forward, forward-backward"),
-        ({"method": "capon", "subarray": (9, 2)}, "1 to 8 rows and 1 to 8 columns of the 8x8 isotropic array; got 9x2"),
-        ({"method": "capon", "taps": (1e-3, 2e-3)}, "no delay tap lies between 0.001 and 0.002 s"),
-        ({"method": "capon", "taps": (0.0, 1e-8), "snapshots": None}, "taps are made of coherent responses"),
+        ("capon", {"sources": 2}, "sources belong to method \"music\"; 'capon'"),
+        ("bartlett", {"loading": Loading(0.1)}, "loading belongs to method \"capon\"; 'bartlett' inverts nothing"),
+        ("music", {"snapshots": None}, "to count sources takes snapshots"),
+        ("music", {"snapshots": 64}, "more snapshots than the 64 elements; got 64"),
+        ("music", {"taps": (0.0, 1e-8)}, "more snapshots than the 64 elements; got 21"),
+        ("music", {"sources": 64}, "between 0 and 63"),
+        ("music", {"sources": "bic"}, "sources must be a number, .mdl. or .aic.; got .bic."),
+        ("capon", {"averaging": "backward"}, "averaging must be one of forward, forward-backward"),
+        ("capon", {"loading": 1e-3}, r"loading must be a Loading, such as Loading\(1e-3\); got 0.001"),
+        ("capon", {"bandwidth": 0.0}, "bandwidth must be a positive number of Hz; got 0.0"),
+        ("capon", {"subarray": (9, 2)}, "1 to 8 rows and 1 to 8 columns of the 8x8 isotropic array; got 9x2"),
+        ("capon", {"taps": (1e-3, 2e-3)}, "no delay tap lies between 0.001 and 0.002 s"),
+        ("capon", {"taps": (0.0, 1e-8), "snapshots": None}, "taps are made of coherent responses"),
     ],
 )
-def test_wrong_arguments_are_told(random_paths, arguments, message):
+def test_wrong_choices_are_told(random_paths, method, choices, message):
     with pytest.raises(InputError, match=message):
-        spectrum_of(random_paths(3), ARRAY, GRID, **arguments)
+        spectrum_of(random_paths(3), ARRAY, GRID, method=method, processing=ArrayProcessing(**choices))
 
 
 @pytest.mark.parametrize(
@@ -190,9 +211,9 @@ def test_impossible_loadings_are_refused(amount, rule, message):
 def test_louder_paths_give_a_louder_picture_and_music_the_same(method, random_paths):
     paths = random_paths(40)
     louder = paths._map(lambda value: 10.0 * value if value.is_complex() else value)
-    extra = {"sources": 9} if method == "music" else {}
+    how = replace(NOISY, sources=9 if method == "music" else None)
     first, second = (
-        spectrum_of(one, ARRAY, GRID, method=method, snr_db=20, **extra).power.double() for one in (paths, louder)
+        spectrum_of(one, ARRAY, GRID, method=method, processing=how).power.double() for one in (paths, louder)
     )
     assert torch.allclose(second, first * (1.0 if method == "music" else 100.0), rtol=1e-4)
 

@@ -10,6 +10,7 @@ from rf3dgs.channel.arrays import planar_array
 from rf3dgs.channel.response import manifold
 from rf3dgs.core.grids import pinhole_grid
 from rf3dgs.spectra.beamformers import bartlett, capon, hann_taper, music, tapered
+from rf3dgs.spectra.config import ArrayProcessing
 from rf3dgs.spectra.covariance import covariance_of
 from rf3dgs.spectra.order import source_count
 from rf3dgs.spectra.scan import spectrum_of
@@ -183,6 +184,6 @@ def test_spectrum_of_is_covariance_then_beamformer(random_paths):
     A = manifold(array, GRID.directions.double())
     expected = {"capon": capon(R, A) / array.peak_gain, "music": music(R, A, 5)}
     for method, power in expected.items():
-        extra = {"sources": 5} if method == "music" else {}
-        found = spectrum_of(paths, array, GRID, method=method, snapshots=64, snr_db=15, seed=3, **extra).power
+        how = ArrayProcessing(snapshots=64, snr_db=15, sources=5 if method == "music" else None)
+        found = spectrum_of(paths, array, GRID, method=method, processing=how, seed=3).power
         assert torch.allclose(found, power.float(), rtol=1e-5)

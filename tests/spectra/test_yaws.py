@@ -9,6 +9,7 @@ from rf3dgs.channel.arrays import planar_array
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import pinhole_grid, sample_grid
+from rf3dgs.spectra.config import ArrayProcessing
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.yaws import at_yaws
 
@@ -57,10 +58,11 @@ def test_overlapping_pictures_agree_everywhere_they_overlap(random_paths):
 
 def test_arrays_turn_with_the_receiver(random_paths):
     paths, grid, array = random_paths(50), pinhole_grid(30, 20, 90), planar_array(4, 4)
-    seen = spectrum_of(at_yaws(paths, YAWS), array, grid, method="bartlett", snapshots=None)
+    how = ArrayProcessing(snapshots=None)
+    seen = spectrum_of(at_yaws(paths, YAWS), array, grid, method="bartlett", processing=how)
     for number, yaw in enumerate(YAWS):
         pose = Pose.from_yaw(paths.rx.position, yaw)
-        alone = spectrum_of(paths, array, grid, method="bartlett", snapshots=None, pose=pose)
+        alone = spectrum_of(paths, array, grid, method="bartlett", processing=how, pose=pose)
         torch.testing.assert_close(seen.power[number], alone.power, rtol=1e-5, atol=1e-12 * float(alone.power.max()))
 
 

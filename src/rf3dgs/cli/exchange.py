@@ -34,6 +34,9 @@ class Import:
     """Of a DeepMIMO folder with several transmitters or receiver sets: which one, such as t001_tx000_r000."""
     count: int | None = None
     """Of a sounding: paths to estimate per receiver; as many as the data tell unless given."""
+    untold: Literal["refuse", "ahead"] = "refuse"
+    """Of a sounding whose arrays do not tell zenith and azimuth: "ahead" takes what is missing as straight ahead of the
+    device."""
 
     def run(self) -> int:
         """Read everything first, then write the file, at once or not at all."""
@@ -43,8 +46,10 @@ class Import:
         kind = kind_of(self.source)
         if self.out.resolve() == self.source.resolve():
             raise InputError(f"--out {self.out} is the source itself; choose another name")
-        for name, owner in (("pair", "deepmimo"), ("count", "sounding")):
-            if getattr(self, name) is not None and kind != owner:
+        untold = None if self.untold == "refuse" else self.untold
+        given = (("pair", self.pair, "deepmimo"), ("count", self.count, "sounding"), ("untold", untold, "sounding"))
+        for name, value, owner in given:
+            if value is not None and kind != owner:
                 what = "DeepMIMO folders" if owner == "deepmimo" else "measured soundings"
                 raise InputError(f"--{name} is for {what}; {self.source} is none")
         with ExitStack() as stack:
@@ -74,7 +79,7 @@ class Import:
             from rf3dgs.propagation.measured import read_sounding
             from rf3dgs.spectra.sage import sage
 
-            paths = sage(read_sounding(self.source), self.count, progress=console()).flat()
+            paths = sage(read_sounding(self.source), self.count, untold=self.untold, progress=console()).flat()
         return (paths[index] for index in range(len(paths.rx))), len(paths.rx), {}
 
 

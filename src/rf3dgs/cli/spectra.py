@@ -2,14 +2,15 @@
 
 import math
 import shutil
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from rf3dgs.cli.show import console, out
 from rf3dgs.core.errors import InputError
+from rf3dgs.spectra.config import ArrayProcessing, Method
 
 if TYPE_CHECKING:
     from rf3dgs.channel.arrays import PlanarArray
@@ -33,8 +34,10 @@ class MakeSpectra:
     preset: Literal["paper", "sphere"] | None = None
     """The paper's protocol: four 300x200 pinholes of 90 degrees around each position, or its native sphere of 360x180;
     a fifth of the positions held out at random. In place of --grid, --size, --fov-deg, --yaws-deg."""
-    method: Literal["ideal", "bartlett", "tapered", "capon", "cbf", "tcbf", "mvdr"] = "ideal"
-    """Ideal narrow lobe, or an array's Bartlett (CBF), Hann-tapered (TCBF) or Capon (MVDR) spectrum."""
+    method: Method = "ideal"
+    """Ideal narrow lobe, or an array's Bartlett (CBF), Hann-tapered (TCBF), Capon (MVDR) or MUSIC spectrum."""
+    lobe_deg: float | None = None
+    """Half-power width of the ideal lobe [deg]; 2, or 1.5 pixels where those are wider, unless given."""
     array: str = "8x8"
     """Rows x columns of the receiving array, at half a wavelength; ideal spectra need none."""
     pattern: Literal["isotropic", "dipole", "patch", "tr38901"] = "patch"
@@ -47,10 +50,8 @@ class MakeSpectra:
     """Horizontal field of view of a pinhole [deg]."""
     yaws_deg: tuple[float, ...] = (0.0,)
     """Turns of the receiver about its vertical axis [deg], a picture for each, all of one set of paths."""
-    snapshots: int | None = 256
-    """Frequencies over 2 GHz that an array's covariance is taken from; None for uncorrelated paths."""
-    snr_db: float | None = None
-    """Signal-to-noise ratio at the elements [dB]; no noise unless given. Array methods only."""
+    processing: Annotated[ArrayProcessing, tyro.conf.arg(name="")] = field(default_factory=ArrayProcessing)
+    """How an array's covariance is measured, averaged and read; array methods only."""
     split: Literal["mixed", "random", "region"] | None = None
     """What is held out: 15 % at random, a region of 15 % and 10 % for validation ("mixed", unless a preset says
     otherwise), or the paper's fifth, at random or in one region."""
@@ -70,11 +71,18 @@ class MakeSpectra:
 
         wish = self.chosen()
         array, grid, yaws = wish.receiver(), wish.directions(), [math.radians(yaw) for yaw in wish.yaws_deg]
+        lobe = None if wish.lobe_deg is None else math.radians(wish.lobe_deg)
 
         def spectra_at(number: int, paths: Paths) -> Spectrum:
-            seed = wish.seed + number * len(yaws)
-            how = {"method": wish.method, "snapshots": wish.snapshots, "snr_db": wish.snr_db, "seed": seed}
-            return spectrum_of(at_yaws(paths, yaws), array, grid, **how)
+            return spectrum_of(
+                at_yaws(paths, yaws),
+                array,
+                grid,
+                method=wish.method,
+                lobe=lobe,
+                processing=None if wish.processing == ArrayProcessing() else wish.processing,
+                seed=wish.seed + number * len(yaws),
+            )
 
         settings = {
             name: value for name, value in asdict(wish).items() if name not in ("paths", "out", "split", "preset")

@@ -54,11 +54,11 @@ def stream_spectra(
     count = len(paths)
     if count == 0:
         raise InputError("there are no receivers to make spectra of")
-    longest, digest = _survey(paths, progress)
     first = spectra_at(0, paths[0])
+    longest, digest = _survey(paths, progress)
     _claim(folder, {"settings": dict(settings), "paths": digest})
     views = len(first) if first.pose.batch_shape else 1
-    scales = common_scales(Precision(), None if first.delay is None else longest)
+    scales = common_scales(Precision(), None if first.delay is None else longest, first.method)
     size = max(1, PIXELS // (views * first.grid.height * first.grid.width), -(-count // MOST_PARTS))
     parts = [
         (folder / f"part-{start:07d}.h5", range(start, min(start + size, count))) for start in range(0, count, size)

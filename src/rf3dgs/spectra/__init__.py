@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from rf3dgs.spectra.codec import PerViewLinear as PerViewLinear
     from rf3dgs.spectra.codec import paper_scale as paper_scale
     from rf3dgs.spectra.codec import window_of as window_of
+    from rf3dgs.spectra.config import ArrayProcessing as ArrayProcessing
+    from rf3dgs.spectra.config import Loading as Loading
     from rf3dgs.spectra.covariance import covariance_of as covariance_of
     from rf3dgs.spectra.covariance import covariance_of_snapshots as covariance_of_snapshots
     from rf3dgs.spectra.covariance import covariance_of_spectrum as covariance_of_spectrum
@@ -24,7 +26,6 @@ if TYPE_CHECKING:
     from rf3dgs.spectra.crb import cramer_rao as cramer_rao
     from rf3dgs.spectra.decorrelation import forward_backward as forward_backward
     from rf3dgs.spectra.decorrelation import smoothed as smoothed
-    from rf3dgs.spectra.loading import Loading as Loading
     from rf3dgs.spectra.loading import loaded as loaded
     from rf3dgs.spectra.order import source_count as source_count
     from rf3dgs.spectra.peaks import find_peaks as find_peaks
@@ -44,6 +45,8 @@ _HOMES = {
     "Spectrum": ".spectrum",
     "Instrument": ".spectrum",
     "spectrum_of": ".scan",
+    "ArrayProcessing": ".config",
+    "Loading": ".config",
     "at_yaws": ".yaws",
     "default_lobe": ".synthesis",
     "array_instrument": ".scan",
@@ -53,7 +56,6 @@ _HOMES = {
     "delay_taps": ".covariance",
     "forward_backward": ".decorrelation",
     "smoothed": ".decorrelation",
-    "Loading": ".loading",
     "loaded": ".loading",
     "source_count": ".order",
     "bartlett": ".beamformers",
@@ -80,6 +82,8 @@ __all__ = [  # noqa: RUF022 (reading order)
     "Spectrum",
     "Instrument",
     "spectrum_of",
+    "ArrayProcessing",
+    "Loading",
     "at_yaws",
     "default_lobe",
     "array_instrument",
@@ -89,7 +93,6 @@ __all__ = [  # noqa: RUF022 (reading order)
     "delay_taps",
     "forward_backward",
     "smoothed",
-    "Loading",
     "loaded",
     "source_count",
     "bartlett",

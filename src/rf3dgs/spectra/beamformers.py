@@ -17,7 +17,8 @@ from torch import Tensor
 
 from rf3dgs.channel.arrays import PlanarArray
 from rf3dgs.core.errors import InputError
-from rf3dgs.spectra.loading import Loading, loaded
+from rf3dgs.spectra.config import Loading
+from rf3dgs.spectra.loading import loaded
 from rf3dgs.spectra.steering import Steering, steering_of
 
 SHARPEST = 1e-12  # share of a steering vector outside the signal subspace that rounding leaves of none
@@ -43,14 +44,15 @@ def tapered(R: Tensor, A: Tensor | Steering, taper: Tensor) -> Tensor:
     return _per_batch(R, A, lambda one: steering.forms(weight[:, None] * one * weight).clamp_min(0.0))
 
 
-def capon(R: Tensor, A: Tensor | Steering, loading: float | Loading = 1e-3) -> Tensor:
+def capon(R: Tensor, A: Tensor | Steering, loading: Loading | None = None) -> Tensor:
     """Capon (MVDR) spectrum `[*batch, *direction]`, power [linear]: 1 / (v^H R^-1 v). Paper eq. 14.
 
-    `loading` is added to the diagonal of R first: a number is a share of the mean element power, other rules are in
-    `Loading`. It must suffice to make R positive definite. For isotropic elements this is eq. 14 to the letter; for
-    others eq. 14 times the element's gain, which keeps noise flat where the element is deaf.
+    `loading` is added to the diagonal of R first, a thousandth of the mean element power unless given. It must suffice
+    to make R positive definite. For isotropic elements this is eq. 14 to the letter; for others eq. 14 times the
+    element's gain, which keeps noise flat where the element is deaf.
     """
     _check(R, A)
+    loading = Loading() if loading is None else loading
     steering, full = steering_of(A), loaded(R.to(torch.complex128), loading)
 
     def scan(one: Tensor) -> Tensor:
@@ -59,7 +61,7 @@ def capon(R: Tensor, A: Tensor | Steering, loading: float | Loading = 1e-3) -> T
             return torch.zeros(math.prod(A.shape[:-1]), dtype=torch.float64)
         factor, failed = torch.linalg.cholesky_ex(one / mean)
         if int(failed):
-            raise InputError(f"R is not positive definite with loading {loading}; use a larger one, such as 1e-3")
+            raise InputError(f"R is not positive definite with {loading}; use a larger one, such as Loading(1e-3)")
         white = steering.forms(torch.cholesky_inverse(factor))
         return torch.where(white > 0, mean / white, torch.zeros_like(white))
 

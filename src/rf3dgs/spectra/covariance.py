@@ -90,6 +90,15 @@ def delay_taps(x: Tensor, bandwidth: float, window: tuple[float, float] | None =
     x = torch.fft.ifft(torch.fft.ifftshift(x.to(torch.complex128), dim=-1), dim=-1) * math.sqrt(count)
     if window is None:
         return x
+    return x[..., _taps_within(count, bandwidth, window)]
+
+
+def tap_count(snapshots: int, bandwidth: float, window: tuple[float, float]) -> int:
+    """How many of the delay taps of `snapshots` frequencies over `bandwidth` [Hz] a window (first, last) [s] keeps."""
+    return int(_taps_within(snapshots, bandwidth, window).sum())
+
+
+def _taps_within(count: int, bandwidth: float, window: tuple[float, float]) -> Tensor:
     first, last = window
     delay = torch.arange(count, dtype=torch.float64) / bandwidth
     chosen = (delay >= first) & (delay <= last)
@@ -98,7 +107,7 @@ def delay_taps(x: Tensor, bandwidth: float, window: tuple[float, float] | None =
             f"no delay tap lies between {first:g} and {last:g} s; there are {count}, from 0 to {float(delay[-1]):g} s, "
             f"{1 / bandwidth:g} s apart"
         )
-    return x[..., chosen]
+    return chosen
 
 
 def covariance_of_spectrum(spectrum: Spectrum, array: PlanarArray) -> Tensor:

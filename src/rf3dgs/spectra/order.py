@@ -1,14 +1,13 @@
 """How many sources a covariance holds: the information criteria of Wax and Kailath, 1985."""
 
 import math
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from rf3dgs.core.errors import InputError
+from rf3dgs.spectra.config import CRITERIA, Criterion
 
-Criterion = Literal["mdl", "aic"]
 SMALLEST = 1e-15  # of the largest eigenvalue: below it eigenvalues are rounding
 
 
@@ -21,7 +20,7 @@ def source_count(R: Tensor, snapshots: int, criterion: Criterion = "mdl") -> Ten
     InputError unless there are more snapshots than elements.
     """
     count = R.shape[-1]
-    if criterion not in ("mdl", "aic"):
+    if criterion not in CRITERIA:
         raise InputError(f'a criterion must be "mdl" or "aic"; got {criterion!r}')
     if snapshots <= count:
         raise InputError(

@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 from functools import lru_cache
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -16,19 +15,16 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid
 from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.spectra.beamformers import bartlett, capon, hann_taper, music, tapered
-from rf3dgs.spectra.covariance import covariance_of
+from rf3dgs.spectra.config import ArrayProcessing, Loading, Method
+from rf3dgs.spectra.covariance import covariance_of, tap_count
 from rf3dgs.spectra.decorrelation import forward_backward, smoothed
-from rf3dgs.spectra.loading import Loading
-from rf3dgs.spectra.order import Criterion, source_count
+from rf3dgs.spectra.order import source_count
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.spectra.steering import PlanarSteering, Steering
 from rf3dgs.spectra.synthesis import ideal_spectrum, pose_for
 
-Method = Literal["ideal", "bartlett", "tapered", "capon", "music", "cbf", "tcbf", "mvdr"]
-Averaging = Literal["forward", "forward-backward"]
 ALIASES = {"cbf": "bartlett", "tcbf": "tapered", "mvdr": "capon"}
 METHODS = ("ideal", "bartlett", "tapered", "capon", "music")
-AVERAGINGS = ("forward", "forward-backward")
 
 
 def spectrum_of(
@@ -38,14 +34,7 @@ def spectrum_of(
     *,
     method: Method = "ideal",
     lobe: float | None = None,
-    snr_db: float | None = None,
-    snapshots: int | None = 256,
-    bandwidth: float = 2e9,
-    taps: tuple[float, float] | None = None,
-    averaging: Averaging = "forward",
-    subarray: tuple[int, int] | None = None,
-    loading: float | Loading = 1e-3,
-    sources: int | Criterion | None = None,
+    processing: ArrayProcessing | None = None,
     pose: Pose | None = None,
     seed: int = 0,
     progress: Progress | None = None,
@@ -53,13 +42,10 @@ def spectrum_of(
     """The spectrum of paths `[*batch, path]` on `grid`: power [linear] per direction, `[*batch, row, col]`.
 
     "ideal": power summed through a Gaussian lobe of half-power width `lobe` [rad]; with delay and AoD, without array.
-    "bartlett" (CBF), "tapered" (TCBF, Hann), "capon" (MVDR, with diagonal `loading`) and "music" (of so many `sources`,
-    or as many as "mdl" or "aic" find): through `array`, from `snapshots` coherent frequencies over `bandwidth` [Hz]
-    (None: uncorrelated paths), or only their delay `taps` between first and last [s], with white noise at `snr_db`
-    (none by default) drawn from `seed`. The covariance may be averaged "forward-backward" and over `subarray` (rows,
-    cols), which then is the array. Levels of arrays are relative to the element's peak gain, so that a path of gain g
-    at boresight gives g; "music" has no level, see `beamformers.music`. `pose` (default: the receivers') turns the grid
-    and the array.
+    "bartlett" (CBF), "tapered" (TCBF, Hann), "capon" (MVDR) and "music": through `array`, from a covariance that
+    `processing` says how to measure and read (256 frequencies over 2 GHz unless given), its noise drawn from `seed`.
+    Levels of arrays are relative to the element's peak gain, so that a path of gain g at boresight gives g; "music" has
+    no level, see `beamformers.music`. `pose` (default: the receivers') turns the grid and the array.
     """
     if grid is None:
         raise InputError("spectrum_of needs a grid; use pinhole_grid, equirect_grid or list_grid")
@@ -67,48 +53,28 @@ def spectrum_of(
     if name not in METHODS:
         raise InputError(f"method must be one of {', '.join((*METHODS, *ALIASES))}; got {method!r}")
     if name == "ideal":
-        if snr_db is not None:
-            raise InputError('an ideal spectrum has no elements to add noise to; use snr_db with method="bartlett"')
+        if processing is not None:
+            raise InputError('an ideal spectrum has no array to process; use processing with method="bartlett"')
         return ideal_spectrum(paths, grid, lobe=lobe, pose=pose, progress=progress)
     if array is None:
         raise InputError(f'method {name!r} needs an array, such as planar_array(8, 8); only "ideal" does without')
     if lobe is not None:
         raise InputError(f'lobe belongs to method "ideal"; the lobe of {name!r} is that of its array')
-    if averaging not in AVERAGINGS:
-        raise InputError(f"averaging must be one of {', '.join(AVERAGINGS)}; got {averaging!r}")
-    if sources is not None and name != "music":
-        raise InputError(f'sources belong to method "music"; {name!r} does not count them')
-    if isinstance(sources, str) and sources not in ("mdl", "aic"):
-        raise InputError(f'sources must be a number, "mdl" or "aic"; got {sources!r}')
-    if name == "music" and snapshots is None and not isinstance(sources, int):
-        raise InputError("to count sources takes snapshots, such as 256; or give sources as a number")
+    how = ArrayProcessing() if processing is None else processing
+    _check_method(name, how)
     pose = pose_for(paths, pose)
     batch = paths.coeff.shape[:-1]
     rows = replace(paths, rx=pose).flat()
-    seen = array if subarray is None else smoothed(torch.zeros(array.count, array.count), array, *subarray)[1]
+    seen = array if how.subarray is None else smoothed(torch.zeros(array.count, array.count), array, *how.subarray)[1]
     steering = PlanarSteering(seen, grid.directions)
     unit = 1.0 if name == "music" else array.peak_gain
     power = torch.empty(len(rows.rx), *grid.shape)
     reporter = Silent() if progress is None else progress
     reporter.start(f"{name} spectra", len(rows.rx))
     for index in range(len(rows.rx)):
-        R = covariance_of(
-            rows[index],
-            array,
-            snapshots=snapshots,
-            bandwidth=bandwidth,
-            taps=taps,
-            snr_db=snr_db,
-            seed=seed + index,
-        )
-        if subarray is not None:
-            R, _ = smoothed(R, array, *subarray)
-        if averaging == "forward-backward":
-            R = forward_backward(R)
-        found = sources if isinstance(sources, int) else None
-        if name == "music" and found is None and snapshots is not None:
-            found = int(source_count(R, snapshots, "aic" if sources == "aic" else "mdl"))
-        power[index] = (beamform(name, R, steering, seen, loading=loading, sources=found) / unit).float()
+        R = _averaged_covariance(rows[index], array, how, seed + index)
+        sources = _sources(R, how) if name == "music" else None
+        power[index] = (beamform(name, R, steering, seen, loading=how.loading, sources=sources) / unit).float()
         reporter.update(index + 1)
     reporter.finish()
     return Spectrum(
@@ -122,13 +88,48 @@ def spectrum_of(
     )
 
 
+def _check_method(name: str, how: ArrayProcessing) -> None:
+    """Refuse what belongs to another method."""
+    if how.sources is not None and name != "music":
+        raise InputError(f'sources belong to method "music"; {name!r} does not count them')
+    if how.loading != Loading() and name != "capon":
+        raise InputError(f'loading belongs to method "capon"; {name!r} inverts nothing')
+    if name == "music" and how.snapshots is None and not isinstance(how.sources, int):
+        raise InputError("to count sources takes snapshots, such as 256; or give sources as a number")
+
+
+def _averaged_covariance(paths: Paths, array: PlanarArray, how: ArrayProcessing, seed: int) -> Tensor:
+    """Covariance `[element, element]` of one receiver, of the subarray where there is one."""
+    R = covariance_of(
+        paths,
+        array,
+        snapshots=how.snapshots,
+        bandwidth=how.bandwidth,
+        taps=how.taps,
+        snr_db=how.snr_db,
+        seed=seed,
+    )
+    if how.subarray is not None:
+        R, _ = smoothed(R, array, *how.subarray)
+    return forward_backward(R) if how.averaging == "forward-backward" else R
+
+
+def _sources(R: Tensor, how: ArrayProcessing) -> int:
+    """How many sources MUSIC looks for in R; delay taps that are kept are its snapshots."""
+    if isinstance(how.sources, int):
+        return how.sources
+    assert how.snapshots is not None
+    snapshots = how.snapshots if how.taps is None else tap_count(how.snapshots, how.bandwidth, how.taps)
+    return int(source_count(R, snapshots, how.sources or "mdl"))
+
+
 def beamform(
     method: str,
     R: Tensor,
     A: Tensor | Steering,
     array: PlanarArray,
     *,
-    loading: float | Loading = 1e-3,
+    loading: Loading | None = None,
     sources: int | None = None,
 ) -> Tensor:
     """Power `[*batch, *direction]` by the method's name; see `beamformers`."""

@@ -127,6 +127,8 @@ def check_spectra(spectra: Spectrum, numbers: Tensor | None = None) -> None:
     """
     if not spectra.pose.batch_shape or len(spectra.pose.batch_shape) != 1 or len(spectra) == 0:
         raise InputError(f"the radio stage needs spectra at a list of positions; got batch {spectra.pose.batch_shape}")
+    if spectra.method == "music":
+        raise InputError('"music" spectra have no level to learn; make spectra of power, such as method "capon"')
     power = spectra.power
     rules = (
         (~torch.isfinite(power).all((-2, -1)), "has NaN or infinite power"),

@@ -29,7 +29,8 @@ VERSION = 1
 # What a file may declare, in bytes and in bytes per byte of the file: one picture is read at a time, and pictures of
 # little but nothing are compressed as far as gzip can.
 LIMITS = {"max_bytes": 2**44, "max_ratio": 1100}
-LOWEST_DB, HIGHEST_DB = -300.0, 27.0  # what gains of spectra may be that are written before all are known
+# What gains may be of spectra that are written before all are known: of power, and of what has no level.
+POWER_DB, MUSIC_DB = (-300.0, 27.0), (0.0, 120.0)
 
 
 def write_spectra(
@@ -90,9 +91,9 @@ def join_parts(parts: Sequence[Path], path: Path, count: int) -> None:
         writer.finish()
 
 
-def common_scales(how: Precision, longest: float | None) -> dict[str, Scale]:
+def common_scales(how: Precision, longest: float | None, method: str = "ideal") -> dict[str, Scale]:
     """Scales for spectra that are written before all of them are known; `longest` delay [s], None without delays."""
-    scales = {"gain": Scale.over(LOWEST_DB, HIGHEST_DB, how.gain_db)}
+    scales = {"gain": Scale.over(*(MUSIC_DB if method == "music" else POWER_DB), how.gain_db)}
     if longest is not None:
         scales |= {"delay": Scale.over(0.0, longest, how.delay), "aod": Scale.over(-1.0, 1.0, how.aod)}
     return scales
