@@ -1,7 +1,9 @@
-"""Paths made by hand, for the tests of every layer."""
+"""Paths made by hand, and a hoarder of HDF5 objects, for the tests of every layer."""
 
 import math
+from contextlib import contextmanager
 
+import h5py
 import pytest
 import torch
 
@@ -77,3 +79,26 @@ def paths_from():
 @pytest.fixture
 def line_of_sight():
     return _line_of_sight
+
+
+@pytest.fixture
+def held_by_others():
+    """A block in which every HDF5 object that is made or opened stays alive, as a debugger keeps local variables."""
+
+    @contextmanager
+    def block():
+        held: list[object] = []
+
+        def holding(function):
+            def called(*arguments, **named):
+                held.append(function(*arguments, **named))
+                return held[-1]
+
+            return called
+
+        with pytest.MonkeyPatch.context() as patch:
+            for name in ("create_dataset", "create_group", "__getitem__"):
+                patch.setattr(h5py.Group, name, holding(getattr(h5py.Group, name)))
+            yield held
+
+    return block

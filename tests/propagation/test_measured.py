@@ -56,6 +56,14 @@ def test_a_sounding_survives_its_file(tmp_path, suffix):
     assert_same(read_sounding(tmp_path / f"site{suffix}"), example())
 
 
+def test_a_sounding_has_the_same_bytes_whoever_holds_the_writers_objects(tmp_path, held_by_others):
+    write_sounding(tmp_path / "alone.h5", example(600))
+    with held_by_others() as held:
+        write_sounding(tmp_path / "watched.h5", example(600))
+    assert held
+    assert (tmp_path / "watched.h5").read_bytes() == (tmp_path / "alone.h5").read_bytes()
+
+
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_the_smallest_sounding_survives_its_file(tmp_path, suffix):
     small = example(

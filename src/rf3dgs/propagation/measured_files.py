@@ -70,8 +70,9 @@ def write_hdf5(path: Path, fields: Fields) -> None:
                 write_text(file.attrs, name, value)
             elif name == "response":
                 packed = {"compression": "gzip", "shuffle": True, "fletcher32": True, "track_times": False}
-                file.create_dataset("response_real", data=np.real(value), **packed)
-                file.create_dataset("response_imag", data=np.imag(value), **packed)
+                # Flushed at once: when Python drops the last reference must not decide where chunks lie in the file.
+                file.create_dataset("response_real", data=np.real(value), **packed).flush()
+                file.create_dataset("response_imag", data=np.imag(value), **packed).flush()
             else:
                 file.create_dataset(name, data=value, track_times=False)
 

@@ -221,7 +221,11 @@ class _GroupWriter:
             write_head(self.group, spectra)
         for name, (values, some) in _physical(spectra, self.floor_db).items():
             codes = self.scales[name].encode(values, some, name)
-            self._dataset(name, codes.shape[1:])[self.done : self.done + len(codes)] = codes
+            dataset = self._dataset(name, codes.shape[1:])
+            dataset[self.done : self.done + len(codes)] = codes
+            # Chunks get their place in the file when the dataset is flushed. Left to the moment when Python drops the
+            # last reference to it, the same spectra would make files of different bytes.
+            dataset.flush()
         self._count(spectra.pose)
 
     def copy(self, source: h5py.Group) -> None:
