@@ -1,17 +1,18 @@
 """Building materials: permittivity and conductivity over frequency, and how rough their surfaces are.
 
-Most are those of Recommendation ITU-R P.2040-3, table 3. `OWN` has what the recommendation lacks: skin by Gabriel, Lau
-and Gabriel, "The dielectric properties of biological tissues: III", Phys. Med. Biol. 41 (1996), dry skin; and cloth,
-whose relative permittivity of 1.7 and loss tangent of 0.02 are a choice of this package, in the middle of what is
-published for cotton and wool.
+Most are those of Recommendation ITU-R P.2040-3, table 3. What the recommendation lacks: dry skin by S. Gabriel, Lau and
+C. Gabriel, "The dielectric properties of biological tissues: III. Parametric models for the dielectric spectrum of
+tissues", Phys. Med. Biol. 41 (1996) 2271; and cloth, whose relative permittivity of 1.7 and loss tangent of 0.02 are a
+choice of this package, in the middle of what is published for cotton and wool.
 """
 
 import math
-from itertools import pairwise
 from typing import NamedTuple
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.units import SPEED_OF_LIGHT
+
+VACUUM_PERMITTIVITY = 8.8541878128e-12  # [F/m]
 
 
 class Material(NamedTuple):
@@ -39,11 +40,22 @@ ITU = {
     "metal": Material(1.0, 0.0, 1e7, 0.0, 1.0, 100.0),
 }
 
-OWN = {
-    "skin": ((2.4, 38.1, 1.44), (10.0, 31.3, 8.01), (28.0, 16.6, 25.8), (60.0, 7.98, 36.4), (100.0, 5.60, 39.4)),
-    "cloth": ((1.0, 1.7, 0.00189), (100.0, 1.7, 0.189)),
-}
-"""(f [GHz], relative permittivity, conductivity [S/m]), straight lines between them on logarithmic axes."""
+OWN = {"cloth": Material(1.7, 0.0, 0.00189, 1.0, 1.0, 100.0)}
+
+
+class Tissue(NamedTuple):
+    """`eta - j sigma / w e0` is `high` plus `strength / (1 + (j w time)^(1 - spread))` of each dispersion (Cole-Cole)
+    plus `static / (j w e0)`; times [s], static conductivity [S/m]. Defined from `low_ghz` to `high_ghz`."""
+
+    high: float
+    dispersions: tuple[tuple[float, float, float], ...]
+    static: float
+    low_ghz: float
+    high_ghz: float
+
+
+TISSUES = {"skin": Tissue(4.0, ((32.0, 7.234e-12, 0.0), (1100.0, 32.481e-9, 0.2)), 0.0002, 1.0, 100.0)}
+"""The published model; its two slower dispersions have no strength in dry skin."""
 
 
 class Surface(NamedTuple):
@@ -87,26 +99,24 @@ def permittivity(name: str, frequency: float, *, owner: str = "an object") -> tu
         raise InputError(
             f"{owner} has the material {name!r}, which ITU-R P.2040 does not define at {ghz:g} GHz; use one of {known}"
         )
-    if name in OWN:
-        return _between(OWN[name], ghz)
-    material = ITU[name]
+    if name in TISSUES:
+        return _relaxed(TISSUES[name], frequency)
+    material = (ITU | OWN)[name]
     return material.a * ghz**material.b, material.c * ghz**material.d
 
 
 def names_at(frequency: float) -> list[str]:
     """The materials that are defined at `frequency` [Hz]."""
     ghz = frequency / 1e9
-    ranges = {name: (value.low_ghz, value.high_ghz) for name, value in ITU.items()}
-    ranges |= {name: (points[0][0], points[-1][0]) for name, points in OWN.items()}
-    return [name for name, (low, high) in ranges.items() if low <= ghz <= high]
+    return [name for name, value in (ITU | TISSUES | OWN).items() if value.low_ghz <= ghz <= value.high_ghz]
 
 
-def _between(points: tuple[tuple[float, float, float], ...], ghz: float) -> tuple[float, float]:
-    for (f0, eta0, sigma0), (f1, eta1, sigma1) in pairwise(points):
-        if f0 <= ghz <= f1:
-            share = math.log(ghz / f0) / math.log(f1 / f0)
-            return eta0 * (eta1 / eta0) ** share, sigma0 * (sigma1 / sigma0) ** share
-    raise AssertionError("names_at lets no frequency through that lies outside the points")
+def _relaxed(tissue: Tissue, frequency: float) -> tuple[float, float]:
+    w = 2 * math.pi * frequency
+    eta = complex(tissue.high)
+    for strength, time, spread in tissue.dispersions:
+        eta += strength / (1 + (1j * w * time) ** (1 - spread))
+    return eta.real, tissue.static - eta.imag * w * VACUUM_PERMITTIVITY
 
 
 def mirror_loss(roughness: float, frequency: float, angle: float) -> float:
