@@ -11,10 +11,10 @@ if TYPE_CHECKING:
     from rf3dgs.channel.binning import bin_diffuse as bin_diffuse
     from rf3dgs.channel.binning import stack_paths as stack_paths
     from rf3dgs.channel.io import PathsReader as PathsReader
-    from rf3dgs.channel.io import PathsWriter as PathsWriter
     from rf3dgs.channel.io import load_paths as load_paths
     from rf3dgs.channel.io import save_paths as save_paths
     from rf3dgs.channel.paths import Paths as Paths
+    from rf3dgs.channel.paths_writer import PathsWriter as PathsWriter
     from rf3dgs.channel.patterns import power_pattern as power_pattern
     from rf3dgs.channel.response import cfr as cfr
     from rf3dgs.channel.response import cir as cir
@@ -34,7 +34,7 @@ _HOMES = {
     "stack_paths": ".binning",
     "save_paths": ".io",
     "load_paths": ".io",
-    "PathsWriter": ".io",
+    "PathsWriter": ".paths_writer",
     "PathsReader": ".io",
     "Sounding": ".sounding",
 }

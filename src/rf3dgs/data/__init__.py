@@ -10,7 +10,6 @@ from rf3dgs.core.lazy import lazy_names
 if TYPE_CHECKING:
     from rf3dgs.data.align import Similarity as Similarity
     from rf3dgs.data.dataset import Dataset as Dataset
-    from rf3dgs.data.dataset import Part as Part
     from rf3dgs.data.formats.blender import read_blender as read_blender
     from rf3dgs.data.formats.colmap import read_colmap as read_colmap
     from rf3dgs.data.formats.colmap import write_colmap as write_colmap
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     from rf3dgs.data.formats.rf3dgs_v0 import read_rf3dgs_v0 as read_rf3dgs_v0
     from rf3dgs.data.formats.spectra_codes import Precision as Precision
     from rf3dgs.data.formats.stored import StoredSpectra as StoredSpectra
+    from rf3dgs.data.part import Part as Part
     from rf3dgs.data.photo import Photo as Photo
     from rf3dgs.data.photo import PhotoSet as PhotoSet
     from rf3dgs.data.sfm import poses_from_photos as poses_from_photos
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "Dataset": ".dataset",
-    "Part": ".dataset",
+    "Part": ".part",
     "Photo": ".photo",
     "PhotoSet": ".photo",
     "Precision": ".formats.spectra_codes",

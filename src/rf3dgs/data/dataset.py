@@ -1,9 +1,7 @@
 """`Dataset`: photographs of a site and radio spectra in it, split into train, validation and a sealed test."""
 
-import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +11,7 @@ from torch import Tensor
 from rf3dgs.core.errors import InputError, SealedError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid
+from rf3dgs.data.part import Part, log_read, part_of
 from rf3dgs.data.photo import Photo
 from rf3dgs.data.split import (
     SEALED_ROLES,
@@ -28,27 +27,6 @@ from rf3dgs.spectra.spectrum import Spectrum
 
 if TYPE_CHECKING:
     from rf3dgs.data.formats.spectra_codes import Precision
-
-LOG_NAME = "test_reads.log"
-_log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """One side of a split: its photos, its spectra `[position]`, and what a second solve saw at some of them.
-
-    Spectra of a loaded dataset stay in their file until they are looked at (`StoredSpectra`). Every access to
-    `dataset.train` makes a part anew: keep it in a variable, and what it has read is kept with it.
-    `index` holds the places of these spectra among the dataset's; `repeat[i]` repeats `spectra[repeat_index[i]]`, and
-    both are None where nothing was solved twice.
-    """
-
-    role: str
-    photos: tuple[Photo, ...]
-    spectra: Spectrum | None
-    index: Tensor
-    repeat: Spectrum | None = None
-    repeat_index: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -241,14 +219,7 @@ class Dataset:
         if not reason.strip():
             raise InputError("open_test needs the reason why the test is read, such as 'final evaluation'")
         part = self._part(role)
-        line = f"{datetime.now(UTC).isoformat(timespec='seconds')} {role} {' '.join(reason.split())}"
-        _log.info("sealed test read: %s", line)
-        if self.path is not None and self.path.is_dir():
-            try:
-                with (self.path / LOG_NAME).open("a", encoding="utf-8") as file:
-                    file.write(line + "\n")
-            except OSError as error:
-                _log.warning("%s cannot be written (%s); this read is in the log only", self.path / LOG_NAME, error)
+        log_read(self.path, role, reason)
         return part
 
     @property
@@ -326,15 +297,4 @@ class Dataset:
             raise InputError("the dataset has not been split; call split(test=0.15, seed=0) first")
         photo_roles = self.photo_roles or ("train",) * len(self.photos)
         photos = tuple(photo for photo, each in zip(self.photos, photo_roles, strict=True) if each == role)
-        index = self.where(role)
-        if self._spectra is None:
-            return Part(role, photos, None, index)
-        part = Part(role, photos, self._spectra[index], index)
-        if self._repeat is None or self.repeat_index is None:
-            return part
-        rank = {int(place): order for order, place in enumerate(index)}
-        chosen = [order for order, place in enumerate(self.repeat_index.tolist()) if place in rank]
-        if not chosen:
-            return part
-        local = torch.tensor([rank[int(self.repeat_index[order])] for order in chosen], dtype=torch.int64)
-        return replace(part, repeat=self._repeat[torch.tensor(chosen, dtype=torch.int64)], repeat_index=local)
+        return part_of(role, photos, self._spectra, self.where(role), self._repeat, self.repeat_index)
