@@ -142,6 +142,11 @@ def test_the_papers_preset_gives_four_pictures_of_each_position_on_one_side(writ
     assert sum(each == {"test"} for each in roles) == 1
     assert dataset.roles.count("train") == 16
     assert main(["validate", str(out)]) == 0
+    capsys.readouterr()
+    assert main(["info", str(out)]) == 0
+    told = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert ["positions", "5"] in told
+    assert ["pictures", "16", "train,", "4", "test"] in told or ["pictures", "4", "test,", "16", "train"] in told
 
 
 def test_the_sphere_preset_and_a_region(write_paths, tmp_path, capsys):
@@ -154,7 +159,9 @@ def test_the_sphere_preset_and_a_region(write_paths, tmp_path, capsys):
     assert "test" not in dataset.roles
     fit = ["fit", str(tmp_path / "site"), "--mesh", "lobby", "--out", str(tmp_path / "site.field")]
     assert main([*fit, "--fraction", "1.5"]) == 2
-    assert "fraction must lie in (0, 1]" in capsys.readouterr().err
+    assert (
+        "fraction must lie in (0, 1], the share of the training places to keep, such as 0.2" in capsys.readouterr().err
+    )
 
 
 def test_a_preset_and_what_it_sets_are_not_both_given(write_paths, tmp_path, capsys):

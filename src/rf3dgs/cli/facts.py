@@ -96,8 +96,10 @@ def _dataset_facts(path: Path) -> dict[str, str]:
     facts = {"kind": "dataset", "photographs": str(len(dataset.photos))}
     if dataset.roles:
         grid, tx = dataset.grid, dataset.tx
+        roles = ", ".join(f"{dataset.roles.count(role)} {role}" for role in dict.fromkeys(dataset.roles))
+        places = len(dataset.places.unique())
+        facts |= {"positions": roles} if places == len(dataset.roles) else {"positions": str(places), "pictures": roles}
         facts |= {
-            "positions": ", ".join(f"{dataset.roles.count(role)} {role}" for role in dict.fromkeys(dataset.roles)),
             "grid": f"{grid.kind} {grid.width}x{grid.height}",
             "frequency": f"{dataset.frequency / 1e9:g} GHz",
             "transmitter": "unknown" if tx is None else str([round(value, 3) for value in tx.position.tolist()]),

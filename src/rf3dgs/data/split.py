@@ -87,7 +87,9 @@ def keep_fraction(positions: Tensor, roles: Sequence[str], fraction: float, *, s
     two fractions is part of the larger; all pictures of one place go the same way.
     """
     if not 0.0 < fraction <= 1.0:
-        raise InputError(f"fraction must lie in (0, 1], the share of the training places to keep; got {fraction}")
+        raise InputError(
+            f"fraction must lie in (0, 1], the share of the training places to keep, such as 0.2; got {fraction}"
+        )
     check_roles(positions, roles)
     place, first = places_of(positions)
     pool = np.array([roles[index] in ("train", "unused") for index in first], dtype=bool)
