@@ -198,3 +198,13 @@ def test_lobes_reach_every_pixel_within_their_cut(grid, lobe_deg, random_paths):
         kernel = kernel * (math.pi * lobe**2 / (4 * math.log(2))) / (kernel * grid.solid_angle[..., None]).sum((0, 1))
     expected = (kernel * paths.path_gain.double()).sum(-1)
     assert torch.allclose(spectrum.power.double(), expected, rtol=1e-5, atol=1e-20)
+
+
+def test_receivers_after_the_first_see_what_they_would_see_alone(random_paths):
+    """What a grid and a lobe need is prepared once; another grid in between changes nothing."""
+    grid, paths = equirect_grid(60, 30), random_paths(3000, seed=5)
+    alone = spectrum_of(paths, grid=grid).power
+    spectrum_of(random_paths(2000), grid=grid)
+    assert torch.equal(spectrum_of(paths, grid=grid).power, alone)
+    spectrum_of(paths, grid=pinhole_grid(30, 20, 90))
+    assert torch.equal(spectrum_of(paths, grid=grid).power, alone)

@@ -7,6 +7,7 @@ smoothed by the lobe: along azimuth by FFT, between pairs of rows by a sum. Both
 """
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -63,7 +64,7 @@ def ideal_spectrum(
     pose = pose_for(paths, pose)
     rows = paths.flat()
     world_from_device = pose.world_from_device.reshape(-1, 3, 3)
-    lobe_sum = LobeSum(grid, width)
+    lobe_sum = _lobe_sum(grid, width)
     sums = torch.empty(len(rows.rx), *grid.shape, CHANNELS)
     power = torch.empty(len(rows.rx), *grid.shape)
     reporter = Silent() if progress is None else progress
@@ -99,6 +100,12 @@ def pose_for(paths: Paths, pose: Pose | None) -> Pose:
     if pose.batch_shape:
         raise InputError(f"pose must be one pose or {list(batch)}, one per receiver; got {list(pose.batch_shape)}")
     return Pose(pose.position.expand(*batch, 3), pose.orientation.expand(*batch, 4))
+
+
+@lru_cache(maxsize=1)
+def _lobe_sum(grid: DirectionGrid, lobe: float) -> "LobeSum":
+    """The last one is kept for the next receivers on the same grid: preparing it is a third of the work of a sphere."""
+    return LobeSum(grid, lobe)
 
 
 class LobeSum:
