@@ -71,7 +71,7 @@ class PhotoConfig:
     walk: Literal["level", "coverage"] = "level"
     """Once round looking across, or also out at the walls, down at the floor and up at the ceiling."""
     samples: int = 64
-    """Light paths per pixel, rounded up to a square number; noise falls with the square root."""
+    """Light paths per pixel (a square number at least where something is transparent); noise falls with the root."""
     held_out_samples: int | None = None
     """The same for held-out photographs, which judge the others; None takes `samples`."""
     bounces: int = 6

@@ -16,6 +16,7 @@ from rf3dgs.core.frames import Pose, mitsuba_from_viewmat
 from rf3dgs.core.grids import Camera, equirect_grid
 from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.propagation.config import PhotoConfig
+from rf3dgs.propagation.light import Light, is_matte
 from rf3dgs.propagation.llvm import find_llvm, mitsuba_variant, prepare
 from rf3dgs.propagation.scene import Scene
 from rf3dgs.propagation.scene_files import srgb_from_linear, write_visual_scene
@@ -27,7 +28,8 @@ def render_photos(
 ) -> Iterator[NDArray[np.uint8]]:
     """Yield one photograph `[row, col, 3]`, sRGB bytes, per camera; path traced, the same on every run.
 
-    Works without LLVM too, three times slower. Raises MissingDependencyError without Mitsuba.
+    `propagation.light` follows the light. Mitsuba's own integrator does where something is transparent, and, ten times
+    slower, without LLVM. Raises MissingDependencyError without Mitsuba.
     """
     config = PhotoConfig() if config is None else config
     progress = Silent() if progress is None else progress
@@ -85,18 +87,26 @@ def _studio(scene: Scene, config: PhotoConfig) -> Iterator[Callable[[Camera, int
         import mitsuba
     except ImportError as error:
         raise MissingDependencyError("photographs need Mitsuba: pip install 'rf3dgs[trace]'") from error
-    variant = "llvm_ad_rgb" if find_llvm().path is not None else "scalar_rgb"
-    with tempfile.TemporaryDirectory(prefix="rf3dgs-") as folder, mitsuba_variant(variant):
-        loaded = mitsuba.load_file(str(write_visual_scene(scene, Path(folder))), optimize=False)
-        yield lambda camera, seed: _render(mitsuba, loaded, camera, config, seed)
+    compiled = find_llvm().path is not None
+    with mitsuba_variant("llvm_ad_rgb" if compiled else "scalar_rgb"):
+        if compiled and is_matte(scene):
+            light = Light(scene)
+            yield lambda camera, seed: light.picture(camera, config.samples, config.bounces, seed)
+            return
+        with tempfile.TemporaryDirectory(prefix="rf3dgs-") as folder:
+            loaded = mitsuba.load_file(str(write_visual_scene(scene, Path(folder))), optimize=False)
+            yield lambda camera, seed: render_by_mitsuba(mitsuba, loaded, camera, config, seed)
 
 
 def _developed(light: NDArray[np.float64], scene: Scene, config: PhotoConfig) -> NDArray[np.uint8]:
     return np.round(255.0 * srgb_from_linear(config.exposure * scene.exposure * light)).astype(np.uint8)
 
 
-def _render(mitsuba, loaded, camera: Camera, config: PhotoConfig, seed: int) -> NDArray[np.float64]:
-    """Linear light `[row, col, 3]` that one camera sees."""
+def render_by_mitsuba(mitsuba, loaded, camera: Camera, config: PhotoConfig, seed: int) -> NDArray[np.float64]:
+    """Linear light `[row, col, 3]` that one camera sees in a loaded scene, by the integrator "path" of Mitsuba.
+
+    Samples are rounded up to a square number.
+    """
     samples = (math.isqrt(config.samples - 1) + 1) ** 2
     sensor = mitsuba.load_dict(_sensor(mitsuba, camera, samples))
     integrator = mitsuba.load_dict({"type": "path", "max_depth": config.bounces, "rr_depth": 100})

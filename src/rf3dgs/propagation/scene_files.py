@@ -15,6 +15,8 @@ from rf3dgs.propagation.scene import MAX_ALPHA_R, Scene, SceneObject
 VERSION = "2.1.0"
 LARGEST_XML = 16 * 2**20  # bytes
 LEAST_SAMPLING = 0.2  # light paths that seek a faint light, as a share of those that seek the brightest
+SKY = (0.88, 0.94, 1.0)  # its red, green and blue
+LAMP_REFLECTANCE = 0.05  # of luminous objects
 
 
 def write_radio_scene(
@@ -58,13 +60,13 @@ def write_visual_scene(scene: Scene, folder: str | Path) -> Path:
     _value(integrator, "integer", "max_depth", 6)
     if scene.sky > 0:
         sky = ET.SubElement(root, "emitter", type="constant")
-        _value(sky, "rgb", "radiance", ", ".join(str(round(scene.sky * part, 4)) for part in (0.88, 0.94, 1.0)))
-    elif all(item.glow == 0 for item in scene.objects):
+        _value(sky, "rgb", "radiance", ", ".join(str(round(scene.sky * part, 4)) for part in SKY))
+    place = lamp_of(scene)
+    if place is not None:
         lamp = ET.SubElement(root, "emitter", type="point")
-        (x0, y0, z0), (x1, y1, z1) = scene.bounds
-        position = [f"{value:.4f}" for value in ((x0 + x1) / 2, (y0 + y1) / 2, z0 + 0.9 * (z1 - z0))]
+        position = [f"{value:.4f}" for value in place[0]]
         ET.SubElement(lamp, "point", {"name": "position", **dict(zip("xyz", position, strict=True))})
-        _value(lamp, "rgb", "intensity", str(round(0.3 * scene.size**2, 4)))
+        _value(lamp, "rgb", "intensity", str(round(place[1], 4)))
     brightest = max((item.glow for item in scene.objects), default=0.0)
     for item in scene.objects:
         shape = _shape(root, item, folder)
@@ -75,13 +77,26 @@ def write_visual_scene(scene: Scene, folder: str | Path) -> Path:
         outer = ET.SubElement(whole, "bsdf", type="twosided")
         bsdf = ET.SubElement(outer, "bsdf", type="diffuse")
         if item.glow > 0:
-            _value(bsdf, "rgb", "reflectance", "0.05")
+            _value(bsdf, "rgb", "reflectance", str(LAMP_REFLECTANCE))
             emitter = ET.SubElement(shape, "emitter", type="area")
             _value(emitter, "float", "sampling_weight", round(max(item.glow / brightest, LEAST_SAMPLING), 4))
             _look(emitter, "radiance", item, folder)
         else:
             _look(bsdf, "reflectance", item, folder)
     return _write_xml(root, folder / "visual.xml")
+
+
+def lamp_of(scene: Scene) -> tuple[tuple[float, float, float], float] | None:
+    """Place [m] and intensity of the lamp that a scene without sky and luminous objects gets, or None."""
+    if scene.sky > 0 or any(item.glow > 0 for item in scene.objects):
+        return None
+    (x0, y0, z0), (x1, y1, z1) = scene.bounds
+    return ((x0 + x1) / 2, (y0 + y1) / 2, z0 + 0.9 * (z1 - z0)), 0.3 * scene.size**2
+
+
+def mean_colour(item: SceneObject) -> np.ndarray:
+    """The sRGB colour of an object in [0, 1], of its texture the mean."""
+    return np.array(item.colour) if item.texture is None else item.texture.reshape(-1, 3).mean(0) / 255.0
 
 
 def check_foreign_xml(path: str | Path) -> None:
@@ -144,8 +159,8 @@ def _look(parent: ET.Element, role: str, item: SceneObject, folder: Path) -> Non
     """The colour or texture of an object; light brighter than white is one mean colour."""
     scale = item.glow if item.glow > 0 else 1.0
     if item.texture is None or scale > 1.0:
-        shade = np.array(item.colour) if item.texture is None else item.texture.reshape(-1, 3).mean(0) / 255.0
-        _value(parent, "rgb", role, ", ".join(f"{value:.5f}" for value in scale * linear_from_srgb(shade)))
+        light = scale * linear_from_srgb(mean_colour(item))
+        _value(parent, "rgb", role, ", ".join(f"{value:.5f}" for value in light))
         return
     from PIL import Image
 
