@@ -108,7 +108,7 @@ class Light:
         first = self._scene.ray_intersect_preliminary(ray, coherent=True)
         found = first.is_valid()
         place, normal, face = self._surface(first, ray)
-        light = dr.select(found, self._shine(first, face, ray.d, own), mi.Color3f(*self._sky))
+        light = dr.select(found, self._shine(first, face, ray.d, own + number), mi.Color3f(*self._sky))
 
         def onward(depth: Any, active: Any, at: Any, normal: Any, face: Any, uv: Any, weight: Any, light: Any) -> tuple:
             key = hashed(own + depth * 0x632BE5AB)
