@@ -22,8 +22,8 @@ import torch
 from numpy.typing import NDArray
 
 from rf3dgs.core.grids import Camera
-from rf3dgs.propagation.light_points import hashed, point, unit
-from rf3dgs.propagation.light_tables import light_tables
+from rf3dgs.propagation.light_points import hashed, point
+from rf3dgs.propagation.light_surfaces import Surfaces, off, split
 from rf3dgs.propagation.scene import Scene
 
 CANDIDATES = 4
@@ -32,8 +32,6 @@ THINNED = ((2, 2), (3, 4))
 """From the point of this number (the first is 0) on, one of that many samples is followed, a power of two."""
 TOGETHER = 16
 """Pixels whose samples go on together: at least as many as the processor's registers hold numbers."""
-OFFSET = 2e-5
-"""How far rays begin off a surface, as a share of the size of its coordinates plus 1 m."""
 
 
 def is_matte(scene: Scene) -> bool:
@@ -45,21 +43,7 @@ class Light:
     """A scene in Dr.Jit's memory; Mitsuba must compute with "llvm_ad_rgb" while it is made and used."""
 
     def __init__(self, scene: Scene) -> None:
-        import mitsuba
-
-        tables = light_tables(scene)
-        self._scene = _merged(mitsuba, scene)
-        self._triangles = mitsuba.Float(tables.triangles.reshape(-1))
-        self._uv = mitsuba.Float(tables.uv.reshape(-1))
-        self._looks = mitsuba.Float(tables.looks.reshape(-1))
-        self._pictures = mitsuba.UInt32(tables.pictures.reshape(-1))
-        self._texels = mitsuba.UInt32(tables.texels)
-        self._picks = mitsuba.UInt32(tables.picks)
-        self._chance = mitsuba.Float(tables.chance)
-        self._mean = mitsuba.Float(tables.mean)
-        self._sky, self._lamp = tables.sky, tables.lamp
-        self._linear = mitsuba.Float(_linear_bytes())
-        self._lights = len(tables.picks)
+        self._surfaces = Surfaces(scene)
 
     def picture(self, camera: Camera, samples: int, bounces: int, seed: int) -> NDArray[np.float64]:
         """Linear light `[row, col, 3]`, the mean of `samples` paths of at most `bounces` segments in each pixel."""
@@ -105,19 +89,20 @@ class Light:
         import drjit as dr
         import mitsuba as mi
 
-        first = self._scene.ray_intersect_preliminary(ray, coherent=True)
+        surfaces = self._surfaces
+        first = surfaces.hit(ray, coherent=True)
         found = first.is_valid()
-        place, normal, face = self._surface(first, ray)
-        light = dr.select(found, self._shine(first, face, ray.d, own + number), mi.Color3f(*self._sky))
+        place, normal, face = surfaces.place(first, ray)
+        light = dr.select(found, surfaces.shine(first, face, ray.d, own + number), mi.Color3f(*surfaces.sky))
 
         def onward(depth: Any, active: Any, at: Any, normal: Any, face: Any, uv: Any, weight: Any, light: Any) -> tuple:
             key = hashed(own + depth * 0x632BE5AB)
-            weight = weight * self._look(face, uv, 13, hashed(key + number))
+            weight = weight * surfaces.look(face, uv, 13, hashed(key + number))
             last = depth + 2 >= segments
             light = light + dr.select(active, weight * self._lit(at, normal, key, number, last, active), 0.0)
             # The next point, where light that was found by chance counts as far as it was not asked for. The sky is
             # never asked for.
-            if not any(self._sky):
+            if not any(surfaces.sky):
                 active = active & ~last
             before = 1
             for begin, one_of in THINNED:
@@ -125,12 +110,12 @@ class Light:
                 weight = dr.select(depth == begin, weight * (one_of / before), weight)
                 before = one_of
             local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(*point(number, key ^ 0x2C1B3C6D)))
-            ray = mi.Ray3f(_off(at, normal), mi.Frame3f(normal).to_world(local))
-            hit = self._scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+            ray = mi.Ray3f(off(at, normal), mi.Frame3f(normal).to_world(local))
+            hit = surfaces.hit(ray, active)
             found = hit.is_valid() & active
-            light = light + dr.select(active & ~found, weight * mi.Color3f(*self._sky), 0.0)
-            at, normal, face = self._surface(hit, ray)
-            shine = self._shine(hit, face, ray.d, key + number, found)
+            light = light + dr.select(active & ~found, weight * mi.Color3f(*surfaces.sky), 0.0)
+            at, normal, face = surfaces.place(hit, ray)
+            shine = surfaces.shine(hit, face, ray.d, key + number, found)
             asked = self._asked(face, hit.t * hit.t, dr.abs(dr.dot(normal, ray.d)), found)
             share = dr.rcp(1.0 + asked * math.pi / dr.maximum(local.z, 1e-9))
             light = light + dr.select(found & ~last, weight * share * shine, 0.0)
@@ -148,65 +133,16 @@ class Light:
         )
         return dr.while_loop(state, lambda depth, active, *_: active, onward, mode="symbolic")[-1]
 
-    def _surface(self, hit: Any, ray: Any) -> tuple[Any, Any, Any]:
-        """Place, normal towards where the ray came from, and the triangle of a hit."""
-        import drjit as dr
-        import mitsuba as mi
-
-        face = hit.prim_index
-        rows = [dr.gather(mi.Vector4f, self._triangles, 4 * face + part, hit.is_valid()) for part in range(3)]
-        v0, e1, e2 = _split(rows)
-        place = mi.Point3f(v0 + e1 * hit.prim_uv.x + e2 * hit.prim_uv.y)
-        normal = mi.Normal3f(rows[2].y, rows[2].z, rows[2].w)
-        return place, dr.select(dr.dot(normal, ray.d) > 0, -normal, normal), face
-
-    def _look(self, face: Any, uv: Any, column: int, chance: Any, active: Any = True) -> Any:
-        """What a triangle reflects (column 13) or emits (14) at one texel near `uv`; bilinear in the mean."""
-        import drjit as dr
-        import mitsuba as mi
-
-        number = dr.gather(mi.Float, self._triangles, 16 * face + column, active)
-        active = active & (number >= 0.0)
-        number = mi.UInt32(dr.maximum(number, 0.0))
-        picture = dr.gather(mi.Vector4u, self._pictures, number, active)
-        start = dr.gather(mi.Vector4f, self._uv, 2 * face, active)
-        rest = dr.gather(mi.Vector4f, self._uv, 2 * face + 1, active)
-        across = start.x + uv.x * start.z + uv.y * rest.x
-        down = start.y + uv.x * start.w + uv.y * rest.y
-        chance = hashed(chance)
-        column_, row = (
-            _wrapped(mi, value * mi.Float(size) + jitter - 0.5, size)
-            for value, size, jitter in (
-                (across, picture.y, unit(chance << 16)),
-                (down, picture.z, unit(chance & 0xFFFF0000)),
-            )
-        )
-        texel = dr.gather(mi.UInt32, self._texels, picture.x + row * picture.y + column_, active)
-        factor = dr.gather(mi.Vector4f, self._looks, number, active)
-        parts = (dr.gather(mi.Float, self._linear, (texel >> by) & 255, active) for by in (0, 8, 16))
-        return mi.Color3f(*(value * part for value, part in zip((factor.x, factor.y, factor.z), parts, strict=True)))
-
-    def _shine(self, hit: Any, face: Any, along: Any, chance: Any, active: Any = True) -> Any:
-        """Light that the hit triangle sends towards the ray."""
-        import drjit as dr
-        import mitsuba as mi
-
-        if not self._lights:
-            return mi.Color3f(0.0)
-        valid = hit.is_valid() & active
-        row = dr.gather(mi.Vector4f, self._triangles, 4 * face + 2, valid)
-        front = dr.dot(mi.Vector3f(row.y, row.z, row.w), along) < 0
-        return dr.select(front & valid, self._look(face, hit.prim_uv, 14, chance, valid & front), 0.0)
-
     def _asked(self, face: Any, square: Any, cosine: Any, active: Any) -> Any:
         """How densely `_lit` asks for the light of a triangle [1/sr], candidates together."""
         import drjit as dr
         import mitsuba as mi
 
-        if not self._lights:
+        surfaces = self._surfaces
+        if not surfaces.lights:
             return mi.Float(0.0)
-        area = dr.gather(mi.Float, self._triangles, 16 * face + 12, active)
-        chance = dr.gather(mi.Float, self._chance, face, active)
+        area = dr.gather(mi.Float, surfaces.triangles, 16 * face + 12, active)
+        chance = dr.gather(mi.Float, surfaces.chance, face, active)
         return CANDIDATES * chance * square / dr.maximum(area * cosine, 1e-12)
 
     def _lit(self, at: Any, normal: Any, key: Any, number: Any, last: Any, active: Any) -> Any:
@@ -214,13 +150,14 @@ class Light:
         import drjit as dr
         import mitsuba as mi
 
-        if self._lamp is not None:
-            way = mi.Point3f(*self._lamp[0]) - at
+        surfaces = self._surfaces
+        if surfaces.lamp is not None:
+            way = mi.Point3f(*surfaces.lamp[0]) - at
             square = dr.squared_norm(way)
             cosine = dr.dot(normal, way) * dr.rsqrt(square)
-            strength = dr.maximum(cosine, 0.0) * (self._lamp[1] / math.pi) / square
-            return mi.Color3f(strength & self._seen(at, normal, way, active & (cosine > 0)))
-        if not self._lights:
+            strength = dr.maximum(cosine, 0.0) * (surfaces.lamp[1] / math.pi) / square
+            return mi.Color3f(strength & surfaces.seen(at, normal, way, active & (cosine > 0)))
+        if not surfaces.lights:
             return mi.Color3f(0.0)
         across, down = point(number, key ^ 0x165667B1)
         pick, fate = point(number, key ^ 0x7F4A7C15)
@@ -232,23 +169,23 @@ class Light:
             mi.Float(1.0),
         )
         for candidate in range(CANDIDATES):
-            entry = mi.UInt32((pick + candidate) * (self._lights / CANDIDATES))
-            face = dr.gather(mi.UInt32, self._picks, dr.minimum(entry, self._lights - 1), active)
+            entry = mi.UInt32((pick + candidate) * (surfaces.lights / CANDIDATES))
+            face = dr.gather(mi.UInt32, surfaces.picks, dr.minimum(entry, surfaces.lights - 1), active)
             u, v = (_fraction(dr, value + candidate * step) for value, step in ((across, 0.7548777), (down, 0.5698403)))
             flip = u + v > 1.0
             u, v = dr.select(flip, 1.0 - u, u), dr.select(flip, 1.0 - v, v)
-            rows = [dr.gather(mi.Vector4f, self._triangles, 4 * face + part, active) for part in range(4)]
-            v0, e1, e2 = _split(rows)
+            rows = [dr.gather(mi.Vector4f, surfaces.triangles, 4 * face + part, active) for part in range(4)]
+            v0, e1, e2 = split(rows)
             way = mi.Vector3f(v0 + e1 * u + e2 * v - at)
             square = dr.maximum(dr.squared_norm(way), 1e-12)
             length = dr.sqrt(square)
             here = dr.maximum(dr.dot(normal, way), 0.0) / length
             there = dr.maximum(-dr.dot(mi.Vector3f(rows[2].y, rows[2].z, rows[2].w), way), 0.0) / length
-            density = dr.gather(mi.Float, self._chance, face, active) / rows[3].x
+            density = dr.gather(mi.Float, surfaces.chance, face, active) / rows[3].x
             asked = CANDIDATES * density * square / dr.maximum(there, 1e-12)
             share = dr.select(last, 1.0, asked / (asked + here / math.pi))
             shape = here * there * share / (square * math.pi)
-            mean = dr.gather(mi.Float, self._mean, face, active)
+            mean = dr.gather(mi.Float, surfaces.mean, face, active)
             odds = mean * shape / density
             total += odds
             odds = dr.select(total > 0, odds / total, 0.0)
@@ -257,62 +194,10 @@ class Light:
             chosen, chosen_way = dr.select(taken, face, chosen), dr.select(taken, way, chosen_way)
             chosen_uv = dr.select(taken, mi.Point2f(u, v), chosen_uv)
             target = dr.select(taken, mean, target)
-        seen = self._seen(at, normal, chosen_way, active & (total > 0))
-        colour = self._look(chosen, chosen_uv, 14, key + number + 1, seen)
+        seen = surfaces.seen(at, normal, chosen_way, active & (total > 0))
+        colour = surfaces.look(chosen, chosen_uv, 14, key + number + 1, seen)
         return dr.select(seen, colour * (total / (CANDIDATES * target)), 0.0)
-
-    def _seen(self, at: Any, normal: Any, way: Any, active: Any) -> Any:
-        """Whether nothing stands between a point and the one that is `way` from it."""
-        import drjit as dr
-        import mitsuba as mi
-
-        start = _off(at, normal)
-        way = mi.Point3f(at + way) - start
-        length = dr.norm(way)
-        ray = mi.Ray3f(start, way / length)
-        ray.maxt = length * (1.0 - 1e-4)
-        return active & ~self._scene.ray_test(ray, active)
-
-
-def _off(at: Any, normal: Any) -> Any:
-    import drjit as dr
-
-    return at + normal * (OFFSET * (1.0 + dr.max(dr.abs(at))))
 
 
 def _fraction(dr: Any, value: Any) -> Any:
     return value - dr.floor(value)
-
-
-def _wrapped(mi: Any, value: Any, size: Any) -> Any:
-    """The texel that `value` lies in, the picture repeated."""
-    import drjit as dr
-
-    whole = dr.floor(value)
-    wide = mi.Float(size)
-    return dr.minimum(mi.UInt32(dr.maximum(whole - wide * dr.floor(whole / wide), 0.0)), size - 1)
-
-
-def _split(rows: Any) -> tuple[Any, Any, Any]:
-    """First corner and the two edges of a triangle out of its rows of four."""
-    import mitsuba as mi
-
-    a, b, c = rows[:3]
-    return mi.Vector3f(a.x, a.y, a.z), mi.Vector3f(a.w, b.x, b.y), mi.Vector3f(b.z, b.w, c.x)
-
-
-def _merged(mitsuba: Any, scene: Scene) -> Any:
-    """All triangles as one Mitsuba mesh; its rays name a triangle by its row in the tables."""
-    corners = torch.cat([item.vertices[item.faces] for item in scene.objects]).reshape(-1, 3).float()
-    mesh = mitsuba.Mesh("all", len(corners), len(corners) // 3)
-    parameters = mitsuba.traverse(mesh)
-    parameters["vertex_positions"] = mitsuba.Float(corners.numpy().reshape(-1))
-    parameters["faces"] = mitsuba.UInt32(np.arange(len(corners), dtype=np.uint32))
-    parameters.update()
-    return mitsuba.load_dict({"type": "scene", "all": mesh})
-
-
-def _linear_bytes() -> NDArray[np.float32]:
-    from rf3dgs.propagation.scene_files import linear_from_srgb
-
-    return linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
