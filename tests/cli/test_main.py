@@ -13,8 +13,8 @@ from rf3dgs.cli.main import main
 from rf3dgs.cli.show import table
 
 COMMANDS = (
-    *("demo", "trace", "photos", "spectra", "import", "export", "fit", "fit-geometry", "fit-radio"),
-    *("render", "csi", "eval", "view", "info", "validate", "doctor"),
+    *("demo", "trace", "photos", "panoramas", "spectra", "import", "export", "fit", "fit-geometry"),
+    *("fit-radio", "render", "csi", "eval", "view", "info", "validate", "doctor"),
 )
 AT = ("lobby", "--at", "7", "5", "1.5")
 

@@ -12,7 +12,7 @@ import torch
 from rf3dgs.channel.paths import Paths
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import DirectionGrid
+from rf3dgs.core.grids import Camera, DirectionGrid
 from rf3dgs.core.progress import Progress, track
 from rf3dgs.data.dataset import Dataset, Part
 from rf3dgs.data.photo import Photo
@@ -73,8 +73,11 @@ def photos_of(shots: "Sequence[Shot]", folder: Path) -> list[Photo]:
     """The photographs of these shots, whose files lie in `folder`."""
     from rf3dgs.propagation.photo_job import photo_name
 
-    names = [photo_name(number) for number in range(len(shots))]
-    return [Photo(name, shot.camera, folder / name) for name, shot in zip(names, shots, strict=True)]
+    photos = []
+    for number, shot in enumerate(shots):
+        assert isinstance(shot.camera, Camera)
+        photos.append(Photo(photo_name(number), shot.camera, folder / photo_name(number)))
+    return photos
 
 
 def photograph(

@@ -43,11 +43,17 @@ def open_dataset(name: str | Path, *, unseal_test: bool = False) -> "Dataset":
     return dataset
 
 
-def open_scene(name: str) -> "Scene":
-    """The built-in lobby, a scene that ships with Sionna RT, or a Sionna/Mitsuba XML file."""
+def open_scene(name: str, people: int = 0) -> "Scene":
+    """The built-in lobby with so many people, a scene that ships with Sionna RT, or a Sionna/Mitsuba XML file."""
     from rf3dgs.propagation.scenes import scene_of
 
-    return scene_of(name)
+    if people == 0:
+        return scene_of(name)
+    if name not in ("lobby", "lobby-full"):
+        raise InputError(f"--people stand in lobby and lobby-full only; got the scene {name!r}")
+    from rf3dgs.propagation.lobby import lobby
+
+    return lobby("plain" if name == "lobby" else "full", people)
 
 
 def facts_of(path: Path) -> dict[str, str]:

@@ -16,7 +16,7 @@ from rf3dgs.cli.demo import Demo
 from rf3dgs.cli.exchange import Export, Import
 from rf3dgs.cli.fit import Fit, FitGeometry, FitRadio
 from rf3dgs.cli.judge import Eval
-from rf3dgs.cli.make import MakePhotos, Trace
+from rf3dgs.cli.make import MakePanoramas, MakePhotos, Trace
 from rf3dgs.cli.show import complain, out
 from rf3dgs.cli.spectra import MakeSpectra
 from rf3dgs.core.errors import RfError
@@ -26,6 +26,7 @@ Command = (
     Annotated[Demo, name("demo")]
     | Annotated[Trace, name("trace")]
     | Annotated[MakePhotos, name("photos")]
+    | Annotated[MakePanoramas, name("panoramas")]
     | Annotated[MakeSpectra, name("spectra")]
     | Annotated[Import, name("import")]
     | Annotated[Export, name("export")]

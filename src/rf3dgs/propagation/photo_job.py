@@ -6,7 +6,12 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from io import BytesIO
 
-from rf3dgs.core.grids import Camera
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import Camera, Panorama, equirect_grid
 from rf3dgs.core.manifest import Manifest
 from rf3dgs.propagation.config import PhotoConfig
 from rf3dgs.propagation.jobs import Each
@@ -16,13 +21,15 @@ from rf3dgs.propagation.toolchain import fingerprint, made_by, scene_of_run
 SCHEMA = "rf3dgs.photos"
 SHARD_SIZE = 10
 """Photographs in a shard unless said otherwise: some twenty seconds of work."""
+FACES = 6
+"""Seeds that an equirectangular photograph uses: one for each face of a cube."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One photograph to take: by which camera, and how; `config.seed` is its own."""
+    """One photograph to take: by which camera, or all round, and how; `config.seed` is its own."""
 
-    camera: Camera
+    camera: Camera | Panorama
     config: PhotoConfig
 
 
@@ -31,15 +38,21 @@ def photo_name(number: int) -> str:
     return f"{number:05d}.jpg"
 
 
+def shots_all_round(poses: Pose, width: int, config: PhotoConfig) -> list[Shot]:
+    """One equirectangular photograph of `width` x `width / 2` at each pose `[n]`, as `render_panoramas` takes them."""
+    grid = equirect_grid(width, width // 2)
+    return [
+        Shot(Panorama.of(poses[place], grid), replace(config, seed=config.seed + FACES * place))
+        for place in range(len(poses))
+    ]
+
+
 def take(scene: Scene, shots: Sequence[Shot], each: Each) -> Iterator[tuple[int, bytes]]:
     """Yield (place in `shots`, JPEG bytes); shots of one configuration and successive seeds share a loaded scene."""
     from PIL import Image
 
-    from rf3dgs.propagation.photographer import render_photos
-
     for places in _runs(shots):
-        first = shots[places[0]].config
-        pictures = render_photos(scene, [shots[place].camera for place in places], first)
+        pictures = _pictures(scene, [shots[place] for place in places])
         for place, picture in zip(places, pictures, strict=True):
             content = BytesIO()
             Image.fromarray(picture).save(content, "JPEG", quality=95, subsampling=0)
@@ -47,12 +60,25 @@ def take(scene: Scene, shots: Sequence[Shot], each: Each) -> Iterator[tuple[int,
             each()
 
 
+def _pictures(scene: Scene, shots: Sequence[Shot]) -> Iterator[NDArray[np.uint8]]:
+    """The photographs of one run of `_runs`."""
+    from rf3dgs.propagation.photographer import render_panoramas, render_photos
+
+    first = shots[0]
+    if isinstance(first.camera, Panorama):
+        poses = [shot.camera.pose for shot in shots]
+        stacked = Pose(*(torch.stack([getattr(p, part) for p in poses]) for part in ("position", "orientation")))
+        return render_panoramas(scene, stacked, first.camera.width, first.config)
+    return render_photos(scene, [shot.camera for shot in shots if isinstance(shot.camera, Camera)], first.config)
+
+
 def _runs(shots: Sequence[Shot]) -> list[list[int]]:
-    """The places of shots in groups that differ in nothing but seeds, which rise by one."""
-    runs: dict[PhotoConfig, list[list[int]]] = {}
+    """The places of shots in groups that differ in nothing but seeds, which rise by as many as a photograph uses."""
+    runs: dict[tuple[PhotoConfig, int], list[list[int]]] = {}
     for place, shot in enumerate(shots):
-        known = runs.setdefault(replace(shot.config, seed=0), [])
-        if known and shots[known[-1][-1]].config.seed + 1 == shot.config.seed:
+        width = shot.camera.width if isinstance(shot.camera, Panorama) else 0
+        known = runs.setdefault((replace(shot.config, seed=0), width), [])
+        if known and shots[known[-1][-1]].config.seed + (FACES if width else 1) == shot.config.seed:
             known[-1].append(place)
         else:
             known.append([place])

@@ -21,6 +21,9 @@ from rf3dgs.propagation.scene import Scene
 from rf3dgs.propagation.scene_files import srgb_from_linear, write_visual_scene
 from rf3dgs.propagation.walks import camera_tour as camera_tour
 
+ROULETTE_FROM = 3
+"""Light paths of so many segments and more go on by chance, with more weight: as bright in the mean, and cheaper."""
+
 
 def render_photos(
     scene: Scene, cameras: Sequence[Camera], config: PhotoConfig | None = None, progress: Progress | None = None
@@ -88,18 +91,20 @@ def _studio(scene: Scene, config: PhotoConfig) -> Iterator[Callable[[Camera, int
     variant = "llvm_ad_rgb" if find_llvm().path is not None else "scalar_rgb"
     with tempfile.TemporaryDirectory(prefix="rf3dgs-") as folder, mitsuba_variant(variant):
         loaded = mitsuba.load_file(str(write_visual_scene(scene, Path(folder))), optimize=False)
-        yield lambda camera, seed: _render(mitsuba, loaded, camera, config, seed)
+        yield lambda camera, seed: linear_light(mitsuba, loaded, camera, config, seed)
 
 
 def _developed(light: NDArray[np.float64], scene: Scene, config: PhotoConfig) -> NDArray[np.uint8]:
     return np.round(255.0 * srgb_from_linear(config.exposure * scene.exposure * light)).astype(np.uint8)
 
 
-def _render(mitsuba, loaded, camera: Camera, config: PhotoConfig, seed: int) -> NDArray[np.float64]:
-    """Linear light `[row, col, 3]` that one camera sees."""
+def linear_light(
+    mitsuba, loaded, camera: Camera, config: PhotoConfig, seed: int, *, roulette_from: int = ROULETTE_FROM
+) -> NDArray[np.float64]:
+    """Linear light `[row, col, 3]` that one camera sees in a scene loaded into Mitsuba."""
     samples = (math.isqrt(config.samples - 1) + 1) ** 2
     sensor = mitsuba.load_dict(_sensor(mitsuba, camera, samples))
-    integrator = mitsuba.load_dict({"type": "path", "max_depth": config.bounces, "rr_depth": 100})
+    integrator = mitsuba.load_dict({"type": "path", "max_depth": config.bounces, "rr_depth": roulette_from})
     picture = mitsuba.render(loaded, sensor=sensor, integrator=integrator, spp=samples, seed=seed)
     return np.array(picture, dtype=np.float64)[..., :3]
 
