@@ -239,7 +239,7 @@ def test_soft_is_a_share_at_an_edge_and_the_same_away_from_it() -> None:
     obstacles = two_plates()
     start = torch.tensor([[0.0, 0.0, 1.5], [0.0, 0.0, 1.5], [0.0, 2.03, 1.5]])
     end = torch.tensor([[3.0, 0.0, 1.5], [1.0, 0.0, 1.5], [3.0, 2.03, 1.5]])
-    passed = obstacles.soft(start, end)
+    passed = obstacles.soft(start, end, radius=0.05)
     assert float(passed[0]) < 0.01
     assert float(passed[1]) == 1.0
     assert 0.2 < float(passed[2]) < 0.8

@@ -16,7 +16,9 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.native import native_core, thread_count
 from rf3dgs.splats.transmittance import segment_transmittance
 
-SOFT_RADIUS = 0.05  # m
+SOFT_RADIUS = 0.02  # m
+RAYS = 7  # of a soft gate
+_SOFT_CHUNK = 200_000  # segments
 LARGEST_LABEL = 2**31 - 2
 
 
@@ -94,17 +96,28 @@ class Obstacles:
         skip_end: Tensor | None = None,
         stop_short: float = 0.10,
     ) -> Tensor:
-        """Mean transmittance `[segment]` of the segment and six parallel ones at `radius` [m] around it."""
+        """Mean transmittance `[segment]` of the segment and six parallel ones at `radius` [m] around it.
+
+        At a silhouette it falls over the width of the radius. Everything else is as with `transmittance`.
+        """
         start, end = _segments(start, end)
-        total = self.transmittance(start, end, skip_start=skip_start, skip_end=skip_end, stop_short=stop_short)
-        across, up = _across(end - start)
-        for ray in range(6):
-            angle = ray * math.pi / 3
-            shift = radius * (math.cos(angle) * across + math.sin(angle) * up)
-            total = total + self.transmittance(
-                start + shift, end + shift, skip_start=skip_start, skip_end=skip_end, stop_short=stop_short
+        if not 0 <= radius < math.inf:
+            raise InputError(f"radius must be a length in metres, 0 or more; got {radius}")
+        skips = [self._skip(skip, len(start), name) for skip, name in ((skip_start, "start"), (skip_end, "end"))]
+        result = torch.empty(len(start))
+        for index in torch.arange(len(start)).split(_SOFT_CHUNK):
+            first, last = start[index], end[index]
+            shift = _shifts(last - first, radius)
+            first_skip, last_skip = (None if skip is None else skip[index].repeat(RAYS) for skip in skips)
+            passed = self.transmittance(
+                (first + shift).reshape(-1, 3),
+                (last + shift).reshape(-1, 3),
+                skip_start=first_skip,
+                skip_end=last_skip,
+                stop_short=stop_short,
             )
-        return total / 7
+            result[index] = sum(passed.reshape(RAYS, -1).unbind(0), torch.zeros(len(index))) / RAYS
+        return result
 
     @cached_property
     def _tree(self) -> Any:
@@ -159,9 +172,12 @@ def _segments(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
     return start, end
 
 
-def _across(span: Tensor) -> tuple[Tensor, Tensor]:
-    """Two unit vectors `[segment, 3]` across each span and each other."""
+def _shifts(span: Tensor, radius: float) -> Tensor:
+    """Shifts `[RAYS, segment, 3]` [m] across each span: none, and the corners of a hexagon of this radius."""
     along = torch.nn.functional.normalize(span, dim=-1)
     least = torch.nn.functional.one_hot(along.abs().argmin(-1), 3).to(along.dtype)
     across = torch.nn.functional.normalize(torch.linalg.cross(along, least, dim=-1), dim=-1)
-    return across, torch.linalg.cross(along, across, dim=-1)
+    up = torch.linalg.cross(along, across, dim=-1)
+    turns = torch.arange(RAYS - 1) * (2 * math.pi / (RAYS - 1))
+    corners = radius * (turns.cos()[:, None, None] * across + turns.sin()[:, None, None] * up)
+    return torch.cat((torch.zeros_like(corners[:1]), corners))
