@@ -47,9 +47,8 @@ def segment_transmittance(
     start, span = torch.where(finite[:, None], start, 0.0), torch.where(finite[:, None], span, 0.0)
     length = torch.where(finite, length, 0.0)
     along = span / length.clamp_min(1e-9)[:, None]
-    sound = torch.isfinite(torch.cat((means, quats, scales), -1)).all(-1) & (quats.square().sum(-1) > 1e-24)
-    reach = torch.where(sound & (opacities >= min_opacity), scales.amax(-1) * CUT, -1.0)
-    means = torch.where(sound[:, None], means, 0.0)
+    reach = scales.amax(-1) * CUT
+    reach = torch.where(opacities >= min_opacity, reach, -1.0)
     result = torch.ones_like(length)
     for index in torch.arange(len(start)).split(max(1, _PAIRS_PER_CHUNK // max(1, len(means)))):
         first, direction = start[index], along[index]
@@ -63,7 +62,8 @@ def segment_transmittance(
         nearest = torch.minimum(torch.maximum(nearest, low), high)
         distance2 = (offset + nearest[:, None] * step).square().sum(-1)
         blocked = opacities[gaussian].clamp_max(1.0) * torch.exp(-0.5 * distance2)
-        blocked = torch.where(high > low, blocked, 0.0).nan_to_num(0.0)
+        sound = torch.isfinite(scales[gaussian]).all(-1) & (quats[gaussian].square().sum(-1) > 1e-24)
+        blocked = torch.where((high > low) & sound, blocked, 0.0).nan_to_num(0.0)
         if labels is not None:
             for skip in (skip_start, skip_end):
                 if skip is not None:
