@@ -1,16 +1,21 @@
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
+import rf3dgs
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid
 from rf3dgs.core.units import friis_gain
-from rf3dgs.field.sources import Blockers, PointSource, estimate_transmitter, fit_line_of_sight, fit_opening
+from rf3dgs.field.radio_field import RadioField
+from rf3dgs.field.sources import PointSource, estimate_transmitter, fit_line_of_sight, fit_opening
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
+from rf3dgs.splats.obstacles import Obstacles
+from rf3dgs.splats.transmittance import segment_transmittance
 
 
 def cluttered(count: int, *, blocked: int, seed: int, degrees: float = 2.0, lobe: float = 3.0) -> tuple[Spectrum, Pose]:
@@ -78,15 +83,30 @@ def test_a_source_that_nobody_sees_keeps_its_level():
 
 
 def test_a_wall_hides_a_source_and_the_threshold_follows_what_was_seen(wall):
-    blockers = Blockers(wall.means, wall.quats, wall.scales, wall.opacities)
+    obstacles = Obstacles(wall.means, wall.quats, wall.scales, wall.opacities)
     source = PointSource(torch.tensor([1.0, 1.0, 2.0]), torch.tensor([1.0, 1.0, 2.0]))
     receivers = torch.tensor([[2.0, 3.0, 1.0], [5.0, 3.0, 1.0], [4.0, 1.0, 1.5]])
-    assert source.visible(receivers, blockers).tolist() == [True, False, False]
-    haze = replace(blockers, opacities=torch.full_like(blockers.opacities, 0.35))
+    assert source.visible(receivers, obstacles).tolist() == [True, False, False]
+    haze = replace(obstacles, opacities=torch.full_like(obstacles.opacities, 0.35))
     passed = source.transmittance(receivers, haze)
     assert 0.01 < float(passed[1]) < 0.9
     fitted = fit_opening(source, torch.tensor([True, True, True]), receivers, haze)
     assert bool(fitted.visible(receivers, haze).all())
+
+
+def test_the_shipped_field_sees_its_transmitter_where_the_specification_does():
+    assert rf3dgs.__file__ is not None
+    field = RadioField.load(Path(rf3dgs.__file__).parent / "assets" / "lobby.field")
+    low, high = field.bounds.tolist()
+    receivers = Pose.scatter((tuple(low), tuple(high)), 60, 3).position
+    source, obstacles = field.sources[0], field.obstacles
+    shape = (obstacles.means, obstacles.quats, obstacles.scales, obstacles.opacities)
+    passed = segment_transmittance(*shape, source.position[None], receivers)
+    clear = (passed - source.open_above).abs() > 3e-3  # float32 cannot tell the others
+    seen = field.sees_transmitter(Pose(receivers))
+    assert seen[clear].tolist() == (passed > source.open_above)[clear].tolist()
+    assert int(clear.sum()) > 50
+    assert 5 < int(seen.sum()) < 60
 
 
 def test_a_beam_is_one_at_its_centre_and_half_at_half_a_lobe():

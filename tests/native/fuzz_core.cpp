@@ -20,6 +20,7 @@
 #include <vector>
 
 #include "core/thread_pool.hpp"
+#include "obstacles/obstacles.hpp"
 #include "spectra/deposit.hpp"
 #include "spectra/responses.hpp"
 #include "splats/constants.hpp"
@@ -482,6 +483,32 @@ void sums_over_paths() {
   require(std::memcmp(total.data(), repeated.data(), total.size() * sizeof(double)) == 0, "responses differ");
 }
 
+// Segments through hostile Gaussians: what passes is a share, and the same on one thread and on several.
+void segments() {
+  const float centre[3] = {normal(), normal(), normal()};
+  const Scattered of = scattered(one_of<size_t>({0, 1, 15, 16, 17, 257, 5000}), 1, centre, one_of({0.0f, 0.01f, 0.2f}));
+  std::vector<int32_t> labels(of.count);
+  for (int32_t& label : labels) label = one_of({INT32_MIN, -1, 0, 1, INT32_MAX - 1});
+  const Obstacles obstacles(of.means.data(), of.quats.data(), of.scales.data(), of.opacities.data(),
+                            chance(0.7f) ? labels.data() : nullptr, of.count, one_of({0.3f, 0.0f, NAN}));
+  require(obstacles.size() <= of.count, "no Gaussian is made up");
+  const size_t count = one_of<size_t>({0, 1, 63, 64, 65, 300});
+  Floats start(3 * count), end(3 * count), once(count), again(count);
+  for (Floats* points : {&start, &end}) {
+    for (size_t at = 0; at < 3 * count; ++at) {
+      (*points)[at] = chance(0.01f) ? hostile() : centre[at % 3] + (chance(0.2f) ? 0.0f : 4.0f * normal());
+    }
+  }
+  std::vector<int32_t> skip(count);
+  for (int32_t& label : skip) label = one_of({INT32_MIN, -2, -1, 0, 1, INT32_MAX});
+  const Segments asked{start.data(), end.data(), chance(0.5f) ? skip.data() : nullptr,
+                       chance(0.5f) ? skip.data() : nullptr, one_of({0.0f, 0.1f, 1e9f})};
+  obstacles.transmittance(asked, count, 1, once.data());
+  obstacles.transmittance(asked, count, 3, again.data());
+  for (const float share : once) require(share >= 0.0f && share <= 1.0f, "what passes is a share");
+  require(same_bits(once, again), "what passes does not depend on the number of threads");
+}
+
 }  // namespace
 
 int main(int count, char** words) {
@@ -495,6 +522,7 @@ int main(int count, char** words) {
     harmonics();
     trainer();
     sums_over_paths();
+    segments();
     if (round_number % 10 == 0) pool();
     if (round_number % 25 == 5 && forks) fork_and_draw();
   }

@@ -14,6 +14,7 @@ from rf3dgs.core.grids import Camera, pinhole_grid
 from rf3dgs.core.native import native_core
 from rf3dgs.splats.harmonics import evaluate, view_directions
 from rf3dgs.splats.image_loss import l1_ssim
+from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.splats.rasterize import rasterize
 from rf3dgs.splats.rates import Rates
 from rf3dgs.splats.target import Target
@@ -49,7 +50,18 @@ def results() -> dict[str, np.ndarray]:
     rates = Rates(means=1e-3, quats=1e-3, log_scales=5e-3, logit_opacities=1e-2, level=1e-2, bands=1e-3)
     steps = [trainer.step(camera, Target(target), rates) for _ in range(20)]
     gradients = {name: leaf.grad for name, leaf in leaves.items()}
-    arrays = {"picture": raster.values, "weight": raster.weight, "radii": raster.radii, "loss": loss, **gradients}
+    obstacles = Obstacles(scene["means"], scene["quats"], scene["scales"], scene["opacities"])
+    start = torch.randn(400, 3, generator=generator) * 2 + torch.tensor([4.0, 0, 0])
+    end = torch.randn(400, 3, generator=generator) * 2 + torch.tensor([4.0, 0, 0])
+    passed = obstacles.transmittance(start, end)
+    arrays = {
+        "passed": passed,
+        "picture": raster.values,
+        "weight": raster.weight,
+        "radii": raster.radii,
+        "loss": loss,
+        **gradients,
+    }
     kept = {name: tensor.detach().numpy() for name, tensor in arrays.items() if tensor is not None}
     core = native_core()
     assert core is not None
@@ -113,6 +125,14 @@ def test_training_agrees_across_instruction_sets(by_set: dict[str, dict[str, np.
     assert expected[-1] < 0.98 * expected[0]
     for name, got in by_set.items():
         assert np.abs(got["steps"] - expected).max() < 1e-5, name
+
+
+def test_what_passes_agrees_across_instruction_sets(by_set: dict[str, dict[str, np.ndarray]]) -> None:
+    """Positions differ by rounding: 2e-6 m of Gaussians down to 4 mm; below 1e-4 a segment may stop."""
+    expected = by_set["portable"]["passed"]
+    assert 0.05 < (expected > 0.5).mean() < 0.95
+    for name, got in by_set.items():
+        assert np.abs(got["passed"] - expected).max() < 5e-4, name
 
 
 def test_each_instruction_set_gives_the_same_bits_on_one_and_two_threads(

@@ -137,9 +137,9 @@ def test_one_segment_through_a_large_scene_is_quick() -> None:
     )
     durations = []
     for _ in range(7):
-        began = time.perf_counter()
+        began = time.process_time()
         segment_transmittance(*arguments)
-        durations.append(time.perf_counter() - began)
+        durations.append(time.process_time() - began)
     assert min(durations) < 0.05
 
 

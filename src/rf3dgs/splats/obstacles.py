@@ -1,0 +1,183 @@
+"""The Gaussians as obstacles: how much of a straight segment's power they let through, for any number of segments.
+
+What passes is defined in `splats.transmittance`. In the native core the Gaussians stand in a tree, built at the first
+question and kept; without the core the specification itself answers.
+"""
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rf3dgs.core.errors import InputError
+from rf3dgs.core.native import native_core, thread_count
+from rf3dgs.splats.transmittance import segment_transmittance
+
+SOFT_RADIUS = 0.02  # m
+RAYS = 7  # of a soft gate
+_SOFT_CHUNK = 200_000  # segments
+LARGEST_LABEL = 2**31 - 2
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacles:
+    """The Gaussians that stop a ray: means `[N, 3]`, quats `[N, 4]`, scales `[N, 3]` [m] and opacities `[N]` in 0..1.
+
+    labels `[N]` name what a Gaussian belongs to, such as its plane; -1 is nothing. Gaussians fainter than
+    `min_opacity`, or not finite, stop nothing. The tensors must not be changed afterwards.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    labels: Tensor | None = None
+    min_opacity: float = field(default=0.3, kw_only=True)
+
+    def __post_init__(self) -> None:
+        count = len(self.means) if self.means.dim() else 0
+        shapes = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,)}
+        if self.labels is not None:
+            shapes["labels"] = (count,)
+        for name, shape in shapes.items():
+            got = tuple(getattr(self, name).shape)
+            if got != shape:
+                text = ", ".join(("gaussian", *(str(size) for size in shape[1:])))
+                raise InputError(f"{name} must be [{text}] for {count} Gaussians; got {list(got)}. Reshape it")
+        if self.labels is not None and len(self.labels) and int(self.labels.max()) > LARGEST_LABEL:
+            raise InputError(f"labels must be at most {LARGEST_LABEL}; got {int(self.labels.max())}. Number them anew")
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in self.__dict__.items() if name != "_tree"}
+
+    def transmittance(
+        self,
+        start: Tensor,
+        end: Tensor,
+        *,
+        skip_start: Tensor | None = None,
+        skip_end: Tensor | None = None,
+        stop_short: float = 0.10,
+    ) -> Tensor:
+        """Share `[segment]` in 0..1 that passes from `start` to `end` `[segment, 3]` [m], without gradient.
+
+        Gaussians labelled `skip_start` or `skip_end` `[segment]` do not stop that segment; -1 skips nothing.
+        `stop_short` [m] is cut off at both ends. A segment of no length left is free, one that is not finite passes
+        nothing.
+        """
+        start, end = _segments(start, end)
+        if not 0 <= stop_short < math.inf:
+            raise InputError(f"stop_short must be a length in metres, 0 or more; got {stop_short}")
+        first, last = (self._skip(skip, len(start), name) for skip, name in ((skip_start, "start"), (skip_end, "end")))
+        if self._tree is None:
+            return segment_transmittance(
+                *(self.means, self.quats, self.scales, self.opacities, start, end),
+                labels=self.labels,
+                skip_start=first,
+                skip_end=last,
+                stop_short=stop_short,
+                min_opacity=self.min_opacity,
+            )
+        passed = torch.empty(len(start))
+        skips = (None if skip is None else skip.clamp(-1, LARGEST_LABEL + 1).int().numpy() for skip in (first, last))
+        self._tree.transmittance(_floats(start), _floats(end), *skips, stop_short, passed.numpy(), thread_count())
+        return passed
+
+    def soft(
+        self,
+        start: Tensor,
+        end: Tensor,
+        *,
+        radius: float = SOFT_RADIUS,
+        skip_start: Tensor | None = None,
+        skip_end: Tensor | None = None,
+        stop_short: float = 0.10,
+    ) -> Tensor:
+        """Mean transmittance `[segment]` of the segment and six parallel ones at `radius` [m] around it.
+
+        At a silhouette it falls over the width of the radius. Everything else is as with `transmittance`.
+        """
+        start, end = _segments(start, end)
+        if not 0 <= radius < math.inf:
+            raise InputError(f"radius must be a length in metres, 0 or more; got {radius}")
+        skips = [self._skip(skip, len(start), name) for skip, name in ((skip_start, "start"), (skip_end, "end"))]
+        result = torch.empty(len(start))
+        for index in torch.arange(len(start)).split(_SOFT_CHUNK):
+            first, last = start[index], end[index]
+            shift = _shifts(last - first, radius)
+            first_skip, last_skip = (None if skip is None else skip[index].repeat(RAYS) for skip in skips)
+            passed = self.transmittance(
+                (first + shift).reshape(-1, 3),
+                (last + shift).reshape(-1, 3),
+                skip_start=first_skip,
+                skip_end=last_skip,
+                stop_short=stop_short,
+            )
+            result[index] = sum(passed.reshape(RAYS, -1).unbind(0), torch.zeros(len(index))) / RAYS
+        return result
+
+    @cached_property
+    def _tree(self) -> Any:
+        """The Gaussians in the native core's tree, or None without the core."""
+        core = native_core()
+        if core is None:
+            return None
+        labels = None if self.labels is None else self.labels.clamp_min(-1).int().contiguous().numpy()
+        shape = (_floats(tensor) for tensor in (self.means, self.quats, self.scales, self.opacities))
+        return core.Obstacles(*shape, labels, self.min_opacity)
+
+    def _skip(self, skip: Tensor | None, count: int, end: str) -> Tensor | None:
+        if skip is None:
+            return None
+        if self.labels is None:
+            raise InputError(f"skip_{end} needs obstacles with labels; these have none. Give labels when they are made")
+        if skip.shape != (count,):
+            raise InputError(f"skip_{end} must be [segment] for {count} segments; got {list(skip.shape)}")
+        return skip.to(torch.long)
+
+
+def visibility_of(
+    obstacles: Obstacles,
+    means: Tensor,
+    normals: Tensor,
+    tx: Tensor,
+    labels: Tensor | None = None,
+    *,
+    lift: float = 0.05,
+) -> Tensor:
+    """Share `[point]` of the power that reaches surface points `means` `[point, 3]` [m] from `tx` `[3]`.
+
+    A segment starts `lift` [m] off the surface along its normal (`normals` `[point, 3]`, unit, on the side that is
+    lit); obstacles with the point's own one of `labels` `[point]` do not hide it.
+    """
+    if means.shape != normals.shape:
+        raise InputError(f"normals must be {list(means.shape)} as the means; got {list(normals.shape)}")
+    return obstacles.transmittance(means + lift * normals, tx.reshape(1, 3).expand_as(means), skip_start=labels)
+
+
+def _floats(tensor: Tensor) -> Any:
+    return tensor.detach().to("cpu", torch.float32).contiguous().numpy()
+
+
+def _segments(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+    start, end = torch.atleast_2d(start), torch.atleast_2d(end)
+    if start.dim() != 2 or end.dim() != 2 or start.shape[1] != 3 or end.shape[1] != 3:
+        raise InputError(f"start and end must be [segment, 3] in metres; got {list(start.shape)}, {list(end.shape)}")
+    if len(start) != len(end) and 1 not in (len(start), len(end)):
+        raise InputError(f"start and end must be as many, or one of them one; got {len(start)} and {len(end)}")
+    start, end = torch.broadcast_tensors(start, end)
+    return start, end
+
+
+def _shifts(span: Tensor, radius: float) -> Tensor:
+    """Shifts `[RAYS, segment, 3]` [m] across each span: none, and the corners of a hexagon of this radius."""
+    along = torch.nn.functional.normalize(span, dim=-1)
+    least = torch.nn.functional.one_hot(along.abs().argmin(-1), 3).to(along.dtype)
+    across = torch.nn.functional.normalize(torch.linalg.cross(along, least, dim=-1), dim=-1)
+    up = torch.linalg.cross(along, across, dim=-1)
+    turns = torch.arange(RAYS - 1) * (2 * math.pi / (RAYS - 1))
+    corners = radius * (turns.cos()[:, None, None] * across + turns.sin()[:, None, None] * up)
+    return torch.cat((torch.zeros_like(corners[:1]), corners))
