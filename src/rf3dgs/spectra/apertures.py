@@ -20,6 +20,8 @@ from rf3dgs.channel.sounding import Sounding, seen
 
 AT_ONCE = 2**23  # complex numbers of an intermediate result
 FINER = 2  # points of the coarse grids per resolution cell
+WEAKER = 0.25  # of the strongest wave's power: how weak others may be that are taken with it
+SIDE_LOBE = 0.1  # of a wave's power: what those before it may leak into it
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,10 +124,12 @@ class Aperture:
                 there[part] = _in_view(array, fov, theta[part], step[part])
         return there
 
-    def strongest(self, x: Tensor) -> Tensor:
-        """The theta `[5]` on a grid of two points per cell at which |<s, x>| is largest.
+    def strongest(self, x: Tensor, count: int = 1, *, floor: float = 0.0) -> Tensor:
+        """The thetas `[wave, 5]` on a grid of two points per cell at which |<s, x>| is largest, at most `count`.
 
-        Fourier transform over frequency, products with the arrays' waves over the directions in view.
+        Fourier transform over frequency, products with the arrays' waves over the directions in view. Each wave is the
+        strongest from its arrival, no side lobe of those before it, at most 6 dB weaker than the first, and explains
+        at least `floor` of the sum of |x|^2; the first is always there.
         """
         arrivals = _grid(self.sounding.array_rx, self.sounding.fov_rx)
         departures = _grid(self.sounding.array_tx, self.sounding.fov_tx)
@@ -134,17 +138,31 @@ class Aperture:
         bins = FINER * x.shape[-1] if x.shape[-1] > 1 else 1
         profile = torch.fft.ifft(x.to(torch.complex64), n=bins, dim=-1)
         seen_from = (a @ profile.reshape(len(x), -1)).reshape(len(arrivals), -1, bins)
-        best, where = -1.0, (0, 0, 0)
+        found = []
         step = max(1, AT_ONCE // (len(departures) * bins))
         for first in range(0, len(arrivals), step):
             power = torch.view_as_real(b @ seen_from[first : first + step]).square().sum(-1)
-            index = int(power.argmax())
-            value = float(power.reshape(-1)[index])
-            if value > best:
-                arrival, rest = divmod(index, len(departures) * bins)
-                best, where = value, (first + arrival, *divmod(rest, bins))
-        delay = torch.tensor([where[2] * self.sounding.period / bins if bins > 1 else 0.0], dtype=torch.float64)
-        return torch.cat((arrivals[where[0]], departures[where[1]], delay))
+            found.append(power.flatten(1).max(-1))
+        best = torch.cat([part.values for part in found]).double() * (bins**2 / self.size)
+        where = torch.cat([part.indices for part in found])
+        period = self.sounding.period / bins if bins > 1 else 0.0
+        delay = (where % bins).double() * period
+        theta = torch.cat((arrivals, departures[where // bins], delay[:, None]), -1)
+        order = best.argsort(descending=True, stable=True)
+        order = order[best[order] >= max(WEAKER * float(best[order[0]]), floor)].tolist() or [int(order[0])]
+        return theta[self._apart(theta, best, order, count)]
+
+    def _apart(self, theta: Tensor, power: Tensor, order: list[int], count: int) -> list[int]:
+        """Of the waves in this order the first `count` that are no side lobes of those chosen before."""
+        waves, chosen = self.waves(theta), order[:1]
+        for index in order[1:]:
+            if len(chosen) >= count:
+                break
+            shares = [wave[chosen].conj() @ wave[index] / wave.shape[-1] for wave in waves]
+            leaked = (shares[0] * shares[1] * shares[2]).abs().square() * power[chosen]
+            if float(leaked.sum()) < SIDE_LOBE * float(power[index]):
+                chosen.append(index)
+        return chosen
 
 
 def device_direction(cosines: Tensor) -> Tensor:

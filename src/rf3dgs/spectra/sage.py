@@ -22,7 +22,7 @@ from rf3dgs.spectra.apertures import Aperture, device_direction
 from rf3dgs.spectra.crb import Bound, cramer_rao, told_by
 from rf3dgs.spectra.sage_fit import Fit
 
-MOST = 20  # paths per receiver unless told otherwise
+MOST = 40  # paths per receiver unless told otherwise
 ZENITHS = ("aoa_zenith", "aod_zenith")
 Untold = Literal["refuse", "ahead"]
 

@@ -17,6 +17,10 @@ from rf3dgs.spectra.apertures import Aperture
 SWEEPS = 200
 MOVED = 0.01  # of its deviation: a path that moves less in a sweep has arrived
 EARLY = 8  # sweeps after each new path, fewer where they explain nothing that noise does not
+ALONE, TOGETHER = 8, 4  # the first come one by one, then two, three, at most four at a time
+LITTLE = 0.1  # of the unexplained power of an entry: more than ALONE have arrived where a sweep explains less
+ENOUGH = 0.02  # and, where there are more than ALONE, less than this share of what the new ones explain
+SHARED = 0.05  # of its wave: a path that has less in common with the new ones need not move at once
 HALVINGS = 3
 CANCELLING = 4.0  # times the mean power of the response: no path is so strong by itself
 LEAPS = 3  # joint steps tried, each damped more than the one before
@@ -46,21 +50,31 @@ class Fit:
         return max(self.residual_power if self.known is None else self.known, 1e-26 * self.power)
 
     def search(self, most: int, *, selective: bool) -> None:
-        """Add the strongest wave of the residual, one after the other, and let all settle a little each time."""
+        """Add the strongest waves of the residual, a few at a time, and let them and their neighbours settle a little.
+
+        Waves that come together have little in common, and each is worth its description by itself.
+        """
         while len(self.gain) < most and self.residual_power > 1e-24 * self.power:
             before = self.theta, self.gain, self.residual_power
-            fresh = self.aperture.strongest(self.residual)
-            self._set(torch.cat((self.theta, fresh[None])), torch.cat((self.gain, self.gain.new_zeros(1))))
-            for _ in range(4):
-                self._improve(len(self.gain) - 1)
+            together = min(1 + len(self.gain) // ALONE, TOGETHER, most - len(self.gain))
+            fresh = self.aperture.strongest(self.residual, together, floor=self.penalty * self.noise)
+            self._set(torch.cat((self.theta, fresh)), torch.cat((self.gain, self.gain.new_zeros(len(fresh)))))
+            added = range(len(before[1]), len(self.gain))
+            for index in added:
+                for _ in range(4):
+                    self._improve(index)
             self._weigh()
+            near, brought = self._overlapping(added), before[2] - self.residual_power
             for _ in range(EARLY if len(self.gain) > 1 else 0):
                 left = self.residual_power
-                self._sweep()
+                self._sweep(near)
                 self._leap()
-                if self.aperture.size * (left - self.residual_power) < self.noise:
+                explained = left - self.residual_power
+                crowd = len(self.gain) > ALONE
+                if self.aperture.size * explained < self.noise or (crowd and explained < ENOUGH * brought):
                     break
-            if selective and self.aperture.size * (before[2] - self.residual_power) < self.penalty * self.noise:
+            explained = self.aperture.size * (before[2] - self.residual_power)
+            if selective and len(fresh) == 1 and explained < self.penalty * self.noise:
                 self._set(*before[:2])
                 self._weigh()
                 return
@@ -86,13 +100,21 @@ class Fit:
         self.converged, sweeps = not len(self.gain), 0
         while not self.converged and sweeps < SWEEPS:
             sweeps += 1
-            before = self.theta.clone()
+            before, left = self.theta.clone(), self.residual_power
             self._sweep()
             self._leap()
             moved = ((self.theta - before) / self.aperture.cell).abs().amax(-1)
-            deviation = (3 * self.noise / (2 * math.pi**2 * self.aperture.size * self.gain.abs().square())).sqrt()
-            self.converged = bool((moved <= MOVED * deviation.clamp_min(1e-9)).all())
+            disturbance = max(self.noise, self.residual_power)
+            deviation = (3 * disturbance / (2 * math.pi**2 * self.aperture.size * self.gain.abs().square())).sqrt()
+            explained = self.aperture.size * (left - self.residual_power)
+            still = bool((moved <= MOVED * deviation.clamp_min(1e-9)).all())
+            self.converged = still or (len(self.gain) > ALONE and explained < LITTLE * disturbance)
         self.sweeps += sweeps
+
+    def _overlapping(self, those: range) -> list[int]:
+        """The paths whose waves have something in common with one of those, which are among them."""
+        share = self._gram()[list(those)].abs().amax(0) / self.aperture.size
+        return torch.nonzero(share > SHARED).flatten().tolist()
 
     def _worth(self) -> Tensor:
         """How much more power `[path]` would be left over, in all entries, without each path."""
@@ -111,9 +133,9 @@ class Fit:
         self.residual = self.response - self.aperture.model(self.theta, self.gain)
         self.residual_power = float(self.residual.abs().square().mean())
 
-    def _sweep(self) -> None:
-        """Improve every path once, one after the other."""
-        for index in range(len(self.gain)):
+    def _sweep(self, those: list[int] | None = None) -> None:
+        """Improve every path once, or those named, one after the other."""
+        for index in range(len(self.gain)) if those is None else those:
             self._improve(index)
         self._weigh()
 
