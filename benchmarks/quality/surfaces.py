@@ -3,9 +3,9 @@
     python -m benchmarks.quality.surfaces geometry.ply [mesh:40000 ...] [--planes] [--json FILE]
 
 A source is a .ply or `mesh:COUNT`, Gaussians sampled on the meshes. True planes are coplanar faces (within 3 cm and 1
-degree) that are free on their side, with 0.3 m^2 or more, but for round things (columns, pots, plants). A plane is found
-where a plane of the search holds 30 % of it, within 10 cm and 5 degrees. A found plane is false where less than half of
-its patch lies within 10 cm and 15 degrees of a surface of the meshes that is not round. Purity is the share of
+degree) that are free on their side, with 0.3 m^2 or more, but for round things (columns, pots, plants). A plane is
+found where one of the search holds 30 % of it, within 10 cm and 5 degrees. One of the search is false where less than
+half of its patch lies within 10 cm and 15 degrees of a surface of the meshes that is not round. Purity is the share of
 Gaussians (opacity 0.3 or more) whose object is the commonest of their segment; "spots" counts windows, doors, lights
 and the like as part of what they are set in. Normals are judged where the Gaussian is within 10 cm of a surface.
 """

@@ -1,6 +1,7 @@
 """`fit`, `fit-geometry` and `fit-radio`: from a dataset to a field, in one go or stage by stage."""
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from rf3dgs.data.dataset import Dataset
+    from rf3dgs.data.photo import Photo
     from rf3dgs.spectra.spectrum import Spectrum
     from rf3dgs.splats.gaussians import Gaussians
 
@@ -26,7 +28,7 @@ class FitGeometry:
     """Visual stage: Gaussians from photographs, from the mesh of a scene, or from a floor plan."""
 
     dataset: tyro.conf.Positional[Path | None] = None
-    """A dataset folder, or a folder of photographs with poses (COLMAP, nerfstudio, Blender); none with --mesh, --plan."""
+    """A dataset folder, or a folder of photographs with poses (COLMAP, nerfstudio, Blender)."""
     out: Path = Path("geometry.ply")
     """The 3DGS .ply to write."""
     poses: Literal["given", "sfm"] = "given"
@@ -40,6 +42,9 @@ class FitGeometry:
     """Take the geometry from this floor plan (TOML or JSON) instead of photographs."""
     mesh_count: int = 40_000
     """Gaussians on a mesh or a floor plan."""
+    flatten: bool = False
+    """Put the Gaussians of walls and other planes flat on them, where the photographs have them: better for radio,
+    worse to look at."""
     visual: VisualConfig = field(default_factory=VisualConfig)
     """The visual stage."""
 
@@ -76,6 +81,7 @@ class FitGeometry:
             geometry = fit_geometry(
                 photos, self.visual, initial=found.points, progress=console(), checkpoint_dir=with_checkpoints
             )
+            geometry = flat_on_planes(geometry, photos) if self.flatten else geometry
         write_ply(self.out, geometry)
         drop_checkpoints(self.out)
         out(f"{self.out}: {len(geometry):,} Gaussians")
@@ -263,3 +269,15 @@ def geometry_of_plan(path: Path, count: int, seed: int) -> "Gaussians":
 
     mesh = plan_mesh(read_plan(path))
     return sample_mesh(mesh.vertices, mesh.faces, count=count, seed=seed, colours=mesh.colours)
+
+
+def flat_on_planes(geometry: "Gaussians", photos: "Sequence[Photo]") -> "Gaussians":
+    """The Gaussians, those on planes flat on them where the photographs agree on the plane."""
+    import torch
+
+    from rf3dgs.geometry.flatten import flatten
+    from rf3dgs.training.photographs import picture_of
+
+    cameras = [photo.camera for photo in photos]
+    eyes = torch.stack([camera.position for camera in cameras])
+    return flatten(geometry, eyes, cameras, [picture_of(photo) for photo in photos])

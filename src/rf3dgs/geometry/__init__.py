@@ -8,8 +8,10 @@ if TYPE_CHECKING:
     from rf3dgs.geometry.check import GeometryReport as GeometryReport
     from rf3dgs.geometry.check import check_geometry as check_geometry
     from rf3dgs.geometry.config import SurfaceConfig as SurfaceConfig
+    from rf3dgs.geometry.flatten import flattened as flattened
     from rf3dgs.geometry.known import known_surfaces as known_surfaces
     from rf3dgs.geometry.patches import Patches as Patches
+    from rf3dgs.geometry.photometric import refine_planes as refine_planes
     from rf3dgs.geometry.plan import Opening as Opening
     from rf3dgs.geometry.plan import Room as Room
     from rf3dgs.geometry.plan import plan_mesh as plan_mesh
@@ -25,6 +27,8 @@ _HOMES = {
     "SurfaceConfig": ".config",
     "find_surfaces": ".surfaces",
     "known_surfaces": ".known",
+    "refine_planes": ".photometric",
+    "flattened": ".flatten",
     "Room": ".plan",
     "Opening": ".plan",
     "read_plan": ".plan",
@@ -39,6 +43,8 @@ __all__ = [  # noqa: RUF022 (reading order)
     "SurfaceConfig",
     "find_surfaces",
     "known_surfaces",
+    "refine_planes",
+    "flattened",
     "Room",
     "Opening",
     "read_plan",
