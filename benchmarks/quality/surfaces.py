@@ -1,6 +1,6 @@
 """Surfaces of the built-in lobby: planes, segments and normals found in Gaussians against the meshes they show.
 
-    python -m benchmarks.quality.surfaces geometry.ply [mesh:40000 ...] [--planes] [--json FILE]
+    python -m benchmarks.quality.surfaces geometry.ply [mesh:40000 ...] [--planes] [--flatten] [--json FILE]
 
 A source is a .ply or `mesh:COUNT`, Gaussians sampled on the meshes. True planes are coplanar faces (within 3 cm and 1
 degree) that are free on their side, with 0.3 m^2 or more, but for round things (columns, pots, plants). A plane is
@@ -8,6 +8,8 @@ found where one of the search holds 30 % of it, within 10 cm and 5 degrees. One 
 half of its patch lies within 10 cm and 15 degrees of a surface of the meshes that is not round. Purity is the share of
 Gaussians (opacity 0.3 or more) whose object is the commonest of their segment; "spots" counts windows, doors, lights
 and the like as part of what they are set in. Normals are judged where the Gaussian is within 10 cm of a surface.
+With --flatten each .ply is also measured after `flatten` with the shipped photographs, and PSNR [dB] of the held-out
+photographs is printed before and after.
 """
 
 import argparse
@@ -25,11 +27,14 @@ from rf3dgs.cli.chain import geometry_of_mesh
 from rf3dgs.cli.facts import open_dataset
 from rf3dgs.core.files import write_whole
 from rf3dgs.geometry import Surfaces, find_surfaces
+from rf3dgs.geometry.flatten import flatten
 from rf3dgs.geometry.patches import CELL
 from rf3dgs.propagation.lobby import lobby
 from rf3dgs.propagation.scene import Scene
 from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.splats.image_loss import psnr
 from rf3dgs.splats.ply import read_ply
+from rf3dgs.training.photographs import picture_of, render_photo
 
 STEP = 0.03
 ROUND = ("column-3", "column-4", "pot-", "plant-", "table-foot")
@@ -207,17 +212,33 @@ def eyes() -> Tensor:
     return torch.stack([photo.camera.position for photo in open_dataset("lobby").train.photos])
 
 
+def held_out(gaussians: Gaussians) -> float:
+    """Mean PSNR [dB] of the shipped lobby's held-out photographs."""
+    dataset = open_dataset("lobby")
+    photos = [photo for photo, role in zip(dataset.photos, dataset.photo_roles, strict=True) if role == "test"]
+    return sum(float(psnr(render_photo(gaussians, photo.camera), photo.load())) for photo in photos) / len(photos)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", nargs="+", help="a .ply, or mesh:COUNT")
     parser.add_argument("--planes", action="store_true", help="a line for each plane")
+    parser.add_argument("--flatten", action="store_true", help="also measure each .ply flattened")
     parser.add_argument("--json", type=Path, help="write the figures to this file")
     options = parser.parse_args()
     scene, viewpoints = lobby(), eyes()
     truth, table = Truth.of(scene), {}
+    sources: list[tuple[str, Gaussians]] = []
     for source in options.sources:
         kind, _, count = source.partition(":")
-        geometry = geometry_of_mesh(scene, int(count), 0) if kind == "mesh" else read_ply(Path(source))
+        sources.append((source, geometry_of_mesh(scene, int(count), 0) if kind == "mesh" else read_ply(Path(source))))
+        if options.flatten and kind != "mesh":
+            photos = list(open_dataset("lobby").train.photos)
+            cameras, pictures = [photo.camera for photo in photos], [picture_of(photo) for photo in photos]
+            flat = flatten(sources[-1][1], viewpoints, cameras, pictures)
+            print(f"PSNR {held_out(sources[-1][1]):.2f} dB, flat {held_out(flat):.2f} dB")
+            sources.append((f"{source}, flat", flat))
+    for source, geometry in sources:
         wall, cpu = time.perf_counter(), time.process_time()
         surfaces = find_surfaces(geometry, viewpoints)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu

@@ -115,6 +115,8 @@ def test_a_plane_moves_to_where_photographs_agree_and_gaussians_follow() -> None
     flat = flattened(wrong, surfaces, moved, agreement > 0.5)
     assert torch.allclose(flat.means @ moved.normals[0], moved.offsets.expand(len(flat)), atol=1e-5)
     assert torch.allclose((normals(flat) @ moved.normals[0]).abs(), torch.ones(len(flat)), atol=1e-5)
+    eyes = torch.stack([camera.position for camera in cameras])
+    assert torch.allclose(flatten(wrong, eyes, cameras, pictures).means, flat.means, atol=0.02)
     assert flattened(wrong, surfaces, moved, agreement > 2) is wrong
     with pytest.raises(InputError, match="a picture for each camera; got 5 and 0"):
         flatten(wrong, EYES, cameras, [])

@@ -8,6 +8,7 @@ not matter. Collins (1996) with the plane itself as the space that is swept.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -120,13 +121,15 @@ def _refine(
         if trial > best:
             best, move = trial, [value, 0.0, 0.0]
     step = [SWEEP / 2, math.radians(tilt) / 2, math.radians(tilt) / 2]
+    limit = (reach, math.radians(tilt), math.radians(tilt))
     for _ in range(ROUNDS):
-        for axis in (0, 1, 2):
-            for sign in (-1, 1):
-                changed = list(move)
-                changed[axis] += sign * step[axis]
-                trial = agreement(changed)
-                if trial > best and abs(changed[axis]) <= (reach, math.radians(tilt), math.radians(tilt))[axis] + 1e-6:
+        before = -1.0
+        while best > before + LEAST_AGREEMENT:
+            before = best
+            for axis, sign in product((0, 1, 2), (-1, 1)):
+                changed = [value + sign * step[axis] * (place == axis) for place, value in enumerate(move)]
+                trial = agreement(changed) if abs(changed[axis]) <= limit[axis] + 1e-6 else 0.0
+                if trial > best:
                     best, move = trial, changed
         step = [value / 2 for value in step]
     if best < first + LEAST_AGREEMENT:

@@ -20,9 +20,9 @@ from rf3dgs.geometry.patches import Patches, plane_axes, widths
 from rf3dgs.geometry.planes import Planes
 from rf3dgs.splats.gaussians import Gaussians
 
-SAMPLE = 12_000
+SAMPLE = 8_000
 NEARBY = 1.0  # every other candidate is judged by what lies within this distance [m]
-TRIALS = 192
+TRIALS = 128
 REFINEMENTS = 4
 FAILURES = 40  # candidates in a row that may fail before the search ends
 GROWTH = 1.1  # a rougher plane must be this much larger
