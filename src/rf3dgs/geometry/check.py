@@ -1,6 +1,7 @@
 """How far Gaussians can be trusted as a site's surfaces: holes, roughness, opacity, haze, segment by segment."""
 
 import math
+import textwrap
 from dataclasses import asdict, dataclass
 
 import torch
@@ -14,6 +15,7 @@ from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.surface import normals as shortest_axes
 
 LISTED = 20
+LARGEST = 0.98  # the few Gaussians above this quantile of the mass count no more than the others
 HOLLOW = 0.5  # below this weight a direction meets nothing
 VIEWS = 8
 NEAR_SURFACE = 0.10  # [m]
@@ -24,8 +26,8 @@ class SegmentReport:
     """A segment: its Gaussians and their share of all mass; the plane it lies on or -1 and its area [m^2].
 
     coverage: share of the plane's patch, holes filled, that its cells cover. roughness_cm: root mean square distance
-    from its plane, or from the plane of best fit. opacity: mean, weighted by area. spread_deg: median angle between
-    Gaussians' shortest axes and the segment's normals.
+    of what lies on its plane from it, or from the plane of best fit. opacity: mean, weighted by area. spread_deg:
+    median angle between Gaussians' shortest axes and the segment's normals.
     """
 
     segment: int
@@ -79,7 +81,8 @@ class GeometryReport:
                 f"{item.segment:7d}  {item.gaussians:9,}  {100 * item.share:5.1f}  {plane:>5}  {item.area_m2:6.1f}  "
                 f"{100 * item.coverage:7.0f}  {item.roughness_cm:5.1f}  {item.opacity:7.2f}  {item.spread_deg:7.1f}"
             )
-        return "\n".join(lines + [""] * bool(self.remarks) + [f"- {text}" for text in self.remarks])
+        remarks = [textwrap.fill(f"- {text}", 80, subsequent_indent="  ") for text in self.remarks]
+        return "\n".join(lines + [""] * bool(remarks) + remarks)
 
 
 def check_geometry(
@@ -91,6 +94,7 @@ def check_geometry(
     """
     surfaces = find_surfaces(gaussians, viewpoints, config) if surfaces is None else surfaces
     weight = mass(gaussians).double()
+    weight = weight.clamp_max(float(weight.quantile(LARGEST)) if len(weight) else 0.0)
     weight = weight / weight.sum().clamp_min(1e-12)
     count = torch.bincount(surfaces.segment_of, minlength=surfaces.segments)
     share = torch.zeros(surfaces.segments, dtype=weight.dtype).index_add_(0, surfaces.segment_of, weight)
@@ -110,6 +114,8 @@ def _segment(gaussians: Gaussians, surfaces: Surfaces, weight: Tensor, index: in
     plane = int(surfaces.plane_of[mine].max())
     points, part = gaussians.means[mine].double(), weight[mine][:, None]
     if plane >= 0:
+        on = surfaces.plane_of[mine] == plane
+        points, part = points[on], part[on]
         away = points @ surfaces.planes.normals[plane].double() - surfaces.planes.offsets[plane]
         area, coverage = _coverage(surfaces.patches, plane)
     else:
@@ -121,12 +127,12 @@ def _segment(gaussians: Gaussians, surfaces: Surfaces, weight: Tensor, index: in
     return SegmentReport(
         segment=index,
         gaussians=int(mine.sum()),
-        share=float(part.sum()),
+        share=float(weight[mine].sum()),
         plane=plane,
         area_m2=area,
         coverage=coverage,
         roughness_cm=100 * rough,
-        opacity=float((part[:, 0] * gaussians.opacities[mine]).sum() / part.sum()),
+        opacity=float((weight[mine] * gaussians.opacities[mine]).sum() / weight[mine].sum().clamp_min(1e-12)),
         spread_deg=math.degrees(float(cosine.acos().median())),
     )
 
