@@ -1,6 +1,7 @@
 """`fit`, `fit-geometry` and `fit-radio`: from a dataset to a field, in one go or stage by stage."""
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -17,15 +18,16 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from rf3dgs.data.dataset import Dataset
+    from rf3dgs.data.photo import Photo
     from rf3dgs.spectra.spectrum import Spectrum
     from rf3dgs.splats.gaussians import Gaussians
 
 
 @dataclass(frozen=True)
 class FitGeometry:
-    """Visual stage: Gaussians from photographs, or from the mesh of a scene."""
+    """Visual stage: Gaussians from photographs, from the mesh of a scene, or from a floor plan."""
 
-    dataset: tyro.conf.Positional[Path]
+    dataset: tyro.conf.Positional[Path | None] = None
     """A dataset folder, or a folder of photographs with poses (COLMAP, nerfstudio, Blender)."""
     out: Path = Path("geometry.ply")
     """The 3DGS .ply to write."""
@@ -36,8 +38,13 @@ class FitGeometry:
     """With --poses sfm: estimate a radial distortion, or take rendered and undistorted pictures as they are."""
     mesh: str | None = None
     """Take the geometry from this scene's mesh instead of photographs ("lobby", "box", an XML file)."""
+    plan: Path | None = None
+    """Take the geometry from this floor plan (TOML or JSON) instead of photographs."""
     mesh_count: int = 40_000
-    """Gaussians on a mesh."""
+    """Gaussians on a mesh or a floor plan."""
+    flatten: bool = False
+    """Put the Gaussians of walls and other planes flat on them, where the photographs have them: better for radio,
+    worse to look at."""
     visual: VisualConfig = field(default_factory=VisualConfig)
     """The visual stage."""
 
@@ -50,9 +57,18 @@ class FitGeometry:
 
         if self.out.is_dir():
             raise InputError(f"{self.out} is a folder; name the .ply file to write with --out")
+        given = [name for name in ("dataset", "mesh", "plan") if getattr(self, name) is not None]
+        if ("mesh" in given and "plan" in given) or not given:
+            raise InputError(
+                "geometry comes from a folder of photographs, from --mesh or from --plan; "
+                f"got {' and '.join(given) or 'none of them'}"
+            )
         if self.mesh is not None:
             geometry = _from_mesh(self.mesh, self.mesh_count, self.visual.seed)
+        elif self.plan is not None:
+            geometry = geometry_of_plan(self.plan, self.mesh_count, self.visual.seed)
         else:
+            assert self.dataset is not None
             if self.poses == "sfm":
                 found = poses_from_photos(self.dataset, lens=self.lens, progress=console())
             else:
@@ -65,6 +81,7 @@ class FitGeometry:
             geometry = fit_geometry(
                 photos, self.visual, initial=found.points, progress=console(), checkpoint_dir=with_checkpoints
             )
+            geometry = flat_on_planes(geometry, photos) if self.flatten else geometry
         write_ply(self.out, geometry)
         drop_checkpoints(self.out)
         out(f"{self.out}: {len(geometry):,} Gaussians")
@@ -243,3 +260,24 @@ def _from_mesh(name: str, count: int, seed: int) -> "Gaussians":
     from rf3dgs.cli.facts import open_scene
 
     return geometry_of_mesh(open_scene(name), count, seed)
+
+
+def geometry_of_plan(path: Path, count: int, seed: int) -> "Gaussians":
+    """Flattened Gaussians on the surfaces of a floor plan."""
+    from rf3dgs.geometry.plan import plan_mesh, read_plan
+    from rf3dgs.splats.surface import sample_mesh
+
+    mesh = plan_mesh(read_plan(path))
+    return sample_mesh(mesh.vertices, mesh.faces, count=count, seed=seed, colours=mesh.colours)
+
+
+def flat_on_planes(geometry: "Gaussians", photos: "Sequence[Photo]") -> "Gaussians":
+    """The Gaussians, those on planes flat on them where the photographs agree on the plane."""
+    import torch
+
+    from rf3dgs.geometry.flatten import flatten
+    from rf3dgs.training.photographs import picture_of
+
+    cameras = [photo.camera for photo in photos]
+    eyes = torch.stack([camera.position for camera in cameras])
+    return flatten(geometry, eyes, cameras, [picture_of(photo) for photo in photos])
