@@ -170,7 +170,7 @@ class RadioField:
             table = torch.cat((head, rays.arrival, rays.departure, numbers), -1)
             table = table[table[:, 0].argsort(descending=True, stable=True)][:strongest]
         if with_peaks and len(table) < strongest:
-            table = torch.cat((table, self._peaks(pose, strongest - len(table))))
+            table = torch.cat((table, self._peaks(pose, strongest)[: strongest - len(table)]))
             table = table[table[:, 0].argsort(descending=True, stable=True)]
         return torch.cat((table, torch.zeros(strongest - len(table), 10)))
 
