@@ -2,8 +2,8 @@
 
     python -m benchmarks.quality.mirrors --paths FOLDER [--geometry photos|mesh|FILE.ply] [--train 40] [--test 60]
 
-FOLDER holds traced paths of the lobby (`rf3dgs trace lobby --preset realistic --out FOLDER`). Ideal spectra of `--train`
-positions are what sources are fitted to; at `--test` others the strong mirror paths, within 30 dB of the strongest path
+FOLDER holds traced paths of the lobby (`rf3dgs trace lobby --preset realistic --out FOLDER`). Ideal spectra of --train
+positions are what sources are fitted to; at --test others the strong mirror paths, within 30 dB of the strongest path
 of their position, are sought among the rays. One is found when a ray arrives within 1 degree and 1 ns, and right when
 its gain is within 2 dB too. False rays are as strong and have no such path. Rows: planes as the geometry has them,
 refined by peaks, and completed by virtual sources; columns: found and right by order, false rays a position, median

@@ -106,7 +106,7 @@ class RadioField:
         if strongest < 1:
             raise InputError(f"strongest must be at least 1; got {strongest}")
         if parts not in ("all", "sources"):
-            raise InputError(f'parts must be "all" or "sources"; got {parts!r}')
+            raise InputError(f'parts must be "all" or "sources"; got "{parts}"')
         flat = pose.flat()
         if len(flat) == 0:
             raise InputError("paths needs at least one pose; got an empty batch")
