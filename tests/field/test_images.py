@@ -11,7 +11,7 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.field.images import image_chain, mirrored, sequences
-from rf3dgs.field.sources import Marks, PointSources, widened
+from rf3dgs.field.sources import Marks, PointSources, Reach
 from rf3dgs.geometry import Patches, Planes
 from rf3dgs.propagation.room import shoebox
 from rf3dgs.splats.gaussians import Gaussians
@@ -194,7 +194,7 @@ def test_a_mirror_reflects_only_where_it_has_surface():
             assert (1 in rays.order.tolist()) == bool((point[:2] < 3.0).all())
 
 
-def test_widened_patches_answer_as_holds_does():
+def test_reach_answers_as_patches_do():
     generator = torch.Generator().manual_seed(5)
     planes = box_planes()
     points = [torch.rand(30, 3, generator=generator) * SIZE for _ in range(6)]
@@ -204,8 +204,7 @@ def test_widened_patches_answer_as_holds_does():
     patches = Patches.of(planes, points)
     asked = torch.rand(3000, 3, generator=generator) * SIZE
     plane = torch.randint(6, (3000,), generator=generator)
-    wide = widened(patches)
-    assert torch.equal(wide.occupied(plane, wide.cell_of(asked, plane)), patches.holds(asked, plane))
+    assert torch.equal(Reach.of(patches).holds(asked, plane), patches.holds(asked, plane))
 
 
 def test_a_mark_changes_the_reflection_where_it_is():

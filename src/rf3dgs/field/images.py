@@ -55,36 +55,49 @@ def image_chain(tx: Tensor, normals: Tensor, offsets: Tensor, sequence: Tensor) 
     return torch.stack(chain, 1)
 
 
-def fold(chain: Tensor, normals: Tensor, offsets: Tensor, sequence: Tensor, receivers: Tensor) -> Folded:
-    """The broken lines to receivers `[*batch, 3]` for the images `[K, 4, 3]` of sequences `[K, 3]`."""
-    order = (sequence >= 0).sum(-1)
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What folding asks of K sequences, the last reflection first: for each step the rows that have one `[K]`, normals
+    `[K, 3]`, offsets `[K]` and images `[K, 3]`; tx `[3]` and the last images `[K, 3]`.
+    """
+
+    tx: Tensor
+    last: Tensor
+    steps: tuple[tuple[Tensor, Tensor, Tensor, Tensor], ...]
+
+
+def plan_of(chain: Tensor, normals: Tensor, offsets: Tensor, sequence: Tensor) -> Plan:
+    """The plan for the images `[K, 4, 3]` of sequences `[K, 3]` over planes `[P, 3]` and `[P]`."""
+    highest = int((sequence >= 0).sum(-1).max()) if len(sequence) else 0
+    steps = []
+    for step in reversed(range(highest)):
+        index = sequence[:, step].clamp_min(0)
+        steps.append((sequence[:, step] >= 0, normals[index], offsets[index], chain[:, step + 1]))
+    return Plan(chain[0, 0], chain[:, -1], tuple(steps))
+
+
+def fold(plan: Plan, receivers: Tensor) -> Folded:
+    """The broken lines of a plan to receivers `[*batch, 3]`."""
     here = receivers[..., None, :]
-    line = chain[:, -1] - here
+    line = plan.last - here
     distance = torch.linalg.vector_norm(line, dim=-1).clamp_min(1e-3)
-    arrival = line / distance[..., None]
-    shape = (*receivers.shape[:-1], len(sequence))
+    shape = (*receivers.shape[:-1], len(plan.last))
     point = here.expand(*shape, 3)
     possible = torch.ones(shape, dtype=torch.bool)
-    points, cosine = [], []
-    for step in reversed(range(int(order.max()) if len(order) else 0)):
-        plane = sequence[:, step]
-        active, index = plane >= 0, plane.clamp_min(0)
-        normal = normals[index]
-        leg = chain[:, step + 1] - point
+    points = [point] * (HIGHEST_ORDER - len(plan.steps))
+    cosine = [distance.new_ones(()).expand(shape)] * (HIGHEST_ORDER - len(plan.steps))
+    for active, normal, offset, image in plan.steps:
+        leg = image - point
         fall = (leg * normal).sum(-1)
-        share = (offsets[index] - (point * normal).sum(-1)) / torch.where(fall.abs() < 1e-12, 1e-12, fall)
+        share = (offset - (point * normal).sum(-1)) / torch.where(fall.abs() < 1e-12, 1e-12, fall)
         possible &= ~active | ((share > NEAREST) & (share < 1.0 - NEAREST))
         point = torch.where(active[:, None], point + share[..., None] * leg, point)
         length = torch.linalg.vector_norm(leg, dim=-1).clamp_min(1e-9)
         cosine.append(torch.where(active, fall.abs() / length, 1.0))
         points.append(point)
-    while len(points) < HIGHEST_ORDER:
-        points.insert(0, here.expand(*shape, 3))
-        cosine.insert(0, distance.new_ones(shape))
-    points.reverse()
-    cosine.reverse()
-    departure = torch.nn.functional.normalize(points[0] - chain[:, 0], dim=-1, eps=1e-9)
-    return Folded(torch.stack(points, -2), possible, torch.stack(cosine, -1), distance, arrival, departure)
+    departure = torch.nn.functional.normalize(point - plan.tx, dim=-1, eps=1e-9)
+    cosines = torch.stack(cosine[::-1], -1)
+    return Folded(torch.stack(points[::-1], -2), possible, cosines, distance, line / distance[..., None], departure)
 
 
 def sequences(count: int, order: int, *, third: Tensor | None = None) -> Tensor:

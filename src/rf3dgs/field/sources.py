@@ -15,7 +15,7 @@ from torch import Tensor
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
-from rf3dgs.field.images import HIGHEST_ORDER, Folded, fold, image_chain
+from rf3dgs.field.images import HIGHEST_ORDER, Folded, Plan, fold, image_chain, plan_of
 from rf3dgs.geometry import Patches, Planes
 from rf3dgs.geometry.patches import CELL
 from rf3dgs.spectra.spectrum import Instrument
@@ -85,11 +85,44 @@ class Marks:
 
         With `leave_out` the points are those of the marks, and each is told by the others alone.
         """
-        square = (points[:, None] - self.points).square().sum(-1)
-        weight = torch.exp(-0.5 * square / self.width**2) * (plane[:, None] == self.plane)
+        weight = torch.exp(torch.cdist(points, self.points).square() * (-0.5 / self.width**2))
+        weight = weight * (plane[:, None] == self.plane)
         if leave_out:
             weight.fill_diagonal_(0.0)
         return (weight @ self.level_db) / (weight.sum(-1) + MARK_PRIOR)
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """Patches whose every cell beside an occupied one, corners too, is filled: one look-up answers `Patches.holds`.
+
+    axes `[P, 2, 3]`, low `[P, 2]` in cells, shape `[P, 2]`, start `[P]` of each plane in cells `[cell]`.
+    """
+
+    axes: Tensor
+    low: Tensor
+    shape: Tensor
+    start: Tensor
+    cells: Tensor
+
+    @classmethod
+    def of(cls, patches: Patches) -> "Reach":
+        """The same surface, widened by a cell."""
+        shape, cells = patches.shape + 2, []
+        for plane in range(len(patches)):
+            grid = torch.nn.functional.pad(patches.grid(plane).float(), (2, 2, 2, 2))
+            cells.append(torch.nn.functional.max_pool2d(grid[None, None], 3, stride=1)[0, 0].flatten() > 0)
+        sizes = shape.prod(-1)
+        joined = torch.cat(cells) if cells else patches.cells
+        return cls(patches.axes / CELL, patches.low / CELL - 1.0, shape, sizes.cumsum(0) - sizes, joined)
+
+    def holds(self, points: Tensor, plane: Tensor) -> Tensor:
+        """True `[n]` where points `[n, 3]` [m] lie on or within a cell of the surface of their `plane` `[n]`."""
+        cell = ((self.axes[plane] * points[:, None]).sum(-1) - self.low[plane]).floor().long()
+        shape = self.shape[plane]
+        inside = ((cell >= 0) & (cell < shape)).all(-1)
+        place = self.start[plane] + cell[:, 0] * shape[:, 1] + cell[:, 1]
+        return inside & self.cells[torch.where(inside, place, 0)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,21 +190,24 @@ class PointSources:
         return (self.sequence >= 0).sum(-1)
 
     @cached_property
-    def reach(self) -> Patches | None:
-        """The patches with every cell beside an occupied one filled too, so that one look-up asks `Patches.holds`."""
-        return None if self.patches is None else widened(self.patches)
+    def plan(self) -> Plan:
+        """What folding asks of the sources."""
+        return plan_of(self.chain, self.planes.normals, self.planes.offsets, self.sequence)
+
+    @cached_property
+    def reach(self) -> Reach | None:
+        """Where the planes have surface, prepared to be asked fast; None for everywhere."""
+        return None if self.patches is None else Reach.of(self.patches)
 
     def folded(self, receivers: Tensor) -> tuple[Folded, Tensor]:
         """The broken lines to receivers `[*batch, 3]`, and where all their points lie on surface `[*batch, K]`."""
-        lines = fold(self.chain, self.planes.normals, self.planes.offsets, self.sequence, receivers)
+        lines = fold(self.plan, receivers)
         good = lines.possible
         if self.reach is not None:
-            for step in range(int(self.order.max())):
-                plane = self.sequence[:, step].expand(good.shape)
+            for step in range(len(self.plan.steps)):
+                plane = self.sequence[:, step]
                 asked = torch.nonzero(good & (plane >= 0), as_tuple=True)
-                where = plane[asked]
-                cell = self.reach.cell_of(lines.points[..., step, :][asked], where)
-                good[asked] = self.reach.occupied(where, cell)
+                good[asked] = self.reach.holds(lines.points[..., step, :][asked], plane[asked[-1]])
         return lines, good
 
     def gain(self, source: Tensor, distance: Tensor, cosine: Tensor, points: Tensor) -> Tensor:
@@ -198,22 +234,18 @@ class PointSources:
 
         The product over the legs of a way; Gaussians of the planes that a leg joins do not stand in its way.
         """
-        plane = self.sequence[source]
-        last = self.order[source]
-        stops = torch.cat((self.tx.expand(len(source), 1, 3), points, receivers[:, None]), 1)
-        labels = torch.nn.functional.pad(plane, (1, 1), value=-1)
-        leg = torch.arange(HIGHEST_ORDER + 1)
-        way, step = torch.nonzero(leg <= last[:, None], as_tuple=True)
+        longest = len(self.plan.steps)
+        none = torch.full((len(source), 1), -1)
+        stops = torch.cat((self.tx.expand(len(source), 1, 3), points[:, :longest], receivers[:, None]), 1)
+        labels = torch.cat((none, self.sequence[source, :longest], none), 1)
         known = obstacles.labels is not None
-        passed = obstacles.transmittance(
-            stops[way, step],
-            stops[way, step + 1],
-            skip_start=labels[way, step] if known else None,
-            skip_end=labels[way, step + 1] if known else None,
+        passed = obstacles.transmittance(  # legs beyond the last go from the receiver to itself, and are free
+            stops[:, :-1].reshape(-1, 3),
+            stops[:, 1:].reshape(-1, 3),
+            skip_start=labels[:, :-1].reshape(-1) if known else None,
+            skip_end=labels[:, 1:].reshape(-1) if known else None,
         )
-        whole = passed.new_ones(len(source), HIGHEST_ORDER + 1)
-        whole[way, step] = passed
-        return whole.prod(-1)
+        return passed.reshape(-1, longest + 1).prod(-1)
 
     def rays(self, receiver: Tensor, obstacles: Obstacles) -> Rays:
         """What reaches a receiver at `receiver` `[3]` [m]."""
@@ -247,14 +279,3 @@ class PointSources:
         flat = receivers.reshape(-1, 3)
         passed = obstacles.transmittance(self.tx.expand_as(flat), flat)
         return (passed > self.open_above).reshape(receivers.shape[:-1])
-
-
-def widened(patches: Patches) -> Patches:
-    """Patches with every cell beside an occupied one, corners too, filled."""
-    shape = patches.shape + 2
-    cells = []
-    for plane in range(len(patches)):
-        grid = torch.nn.functional.pad(patches.grid(plane).float(), (2, 2, 2, 2))
-        cells.append(torch.nn.functional.max_pool2d(grid[None, None], 3, stride=1)[0, 0].flatten() > 0)
-    joined = torch.cat(cells) if cells else patches.cells
-    return Patches(patches.axes, patches.low - CELL, shape, joined)
