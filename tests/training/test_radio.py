@@ -122,6 +122,19 @@ def test_delay_and_departure_follow_the_truth(trained, held_out):
     assert math.degrees(float(angle_between(rendered.aod, held_out.aod).median())) < 8
 
 
+def test_planes_come_along_when_mirrors_are_asked_for(training, held_out):
+    field = fit_radio(room(0.15), training, replace(QUICK, steps=0, mirror_order=1, detail="keep"))
+    assert field.sources is not None
+    assert len(field.sources.planes) >= 6
+    assert field.plane_of is not None
+    assert len(field.plane_of) == len(field.surface)
+    assert bool((field.plane_of >= 0).float().mean() > 0.9)
+    paths = field.paths(held_out.pose, parts="sources")
+    assert paths.order is not None
+    assert bool(((paths.order == 0) & paths.valid).any(-1).all())
+    assert int(paths.order.max()) <= 1
+
+
 def test_the_paper_s_own_encoding_learns_the_level(training, held_out):
     config = replace(RadioConfig.paper(steps=150), lr_level=2e-2, lr_csi=2e-2, backend="reference")
     field = fit_radio(room(), training, config)

@@ -215,19 +215,21 @@ class PointSources:
 
         They are reflected at `cosine` `[n, 3]` of incidence in `points` `[n, 3, 3]`.
         """
-        level_db = self.level_db + self.reflection_db(source, cosine, points).sum(-1)
+        level_db = self.level_db + self.reflection_db(source, cosine, points)
         return friis_gain(distance, self.frequency) * 10.0 ** (level_db / 10.0)
 
     def reflection_db(self, source: Tensor, cosine: Tensor, points: Tensor) -> Tensor:
-        """10 log10 Gamma `[n, 3]` of each reflection of sources `[n]`, 0 beyond the last."""
-        plane = self.sequence[source]
-        if not len(self.planes):
-            return torch.zeros_like(cosine)
-        a, b, c = self.reflection[plane.clamp_min(0)].unbind(-1)
-        level_db = a + b * cosine + c * cosine * cosine
+        """Sum `[n]` of 10 log10 Gamma over the reflections of ways as in `gain`."""
+        planes = self.sequence[source]
+        way, step = torch.nonzero(planes >= 0, as_tuple=True)
+        if not len(way):
+            return cosine.new_zeros(len(source))
+        plane, cos = planes[way, step], cosine[way, step]
+        a, b, c = self.reflection[plane].unbind(-1)
+        level_db = a + b * cos + c * cos * cos
         if self.marks is not None:
-            level_db = level_db + self.marks.at(points.reshape(-1, 3), plane.reshape(-1)).reshape(plane.shape)
-        return torch.where(plane >= 0, level_db.clamp_max(0.0), 0.0)
+            level_db = level_db + self.marks.at(points[way, step], plane)
+        return cosine.new_zeros(len(source)).index_add_(0, way, level_db.clamp_max(0.0).to(cosine.dtype))
 
     def transmittance(self, source: Tensor, points: Tensor, receivers: Tensor, obstacles: Obstacles) -> Tensor:
         """Share `[n]` that passes on the ways from the transmitter over `points` `[n, 3, 3]` to `receivers` `[n, 3]`.
