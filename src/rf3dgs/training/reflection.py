@@ -12,7 +12,7 @@ from rf3dgs.field.sources import Marks, PointSources, Rays
 from rf3dgs.field.transmitter import pixel_of
 from rf3dgs.spectra.spectrum import Spectrum
 
-APART_LOBES = 0.9
+APART_LOBES, APART_FROM_SIGHT = 0.9, 2.0
 LEAST_RING = 8
 HUBER_DB = 1.5
 ROUNDS = 30
@@ -61,7 +61,8 @@ def glints(sources: PointSources, rays: list[Rays], spectra: Spectrum) -> Glints
         power, ring = ray_powers(spectrum, one.arrival)
         free = friis_gain(one.delay * SPEED_OF_LIGHT, sources.frequency) * 10 ** (sources.level_db / 10)
         apart = angle_between(one.arrival[:, None], one.arrival[None]) + torch.pi * torch.eye(len(one))
-        crowded = (apart < APART_LOBES * spectrum.instrument.lobe) & (power > 0.25 * power[:, None])
+        lobes = torch.where(one.order == 0, APART_FROM_SIGHT, APART_LOBES)
+        crowded = (apart < lobes * spectrum.instrument.lobe) & (power > 0.25 * power[:, None])
         for ray in torch.nonzero((one.order == 1) & torch.isfinite(ring)).squeeze(-1).tolist():
             plane = int(sources.sequence[one.index[ray], 0])
             leg = torch.nn.functional.normalize(one.points[ray, 0] - sources.tx, dim=-1)
