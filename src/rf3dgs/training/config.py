@@ -23,6 +23,9 @@ class RadioConfig:
     line_of_sight: Literal["source", "surface"] = "source"
     """"source": the transmitter is a point source of its own, its pixels are masked in the surface's training;
     "surface": the Gaussians must show it too, as in the paper."""
+    mirror_order: int = 0
+    """Most reflections of the mirror images that are point sources beside the transmitter; 0 is the line of sight
+    alone."""
     degree: int = 3
     """Degree of the gain's harmonics."""
     floor_db: float | None = None
@@ -179,3 +182,29 @@ class VisualConfig:
     """Which rasterizer works."""
     checkpoint_every: int = 1_000
     """Iterations between checkpoints when a checkpoint folder is given."""
+
+
+@dataclass(frozen=True)
+class SourceConfig:
+    """Which mirror images of the transmitter are point sources, and how they are fitted."""
+
+    order: int = 2
+    """Most reflections of a way; 0 is the line of sight alone. Order 3 is tried over the largest planes only."""
+    largest: int = 6
+    """Over how many of the largest planes ways of order 3 are tried."""
+    planes: int = 40
+    """The largest planes that are mirrors; smaller ones only block."""
+    complete: bool = True
+    """Whether mirrors that the geometry lacks are found where secondary peaks of the spectra meet."""
+    refine: bool = True
+    """Whether planes are moved, within what geometry allows, to where the peaks of their images are."""
+    plane_error: float = 0.05
+    """How far a plane of the geometry may lie off [m], one standard deviation."""
+    plane_error_deg: float = 1.0
+    """How far it may be turned [deg], one standard deviation."""
+    least_db: float = 40.0
+    """Sources that stay so many dB under the strongest part of the spectrum everywhere are left out."""
+    most: int = 200
+    """At most so many sources are kept, the strongest ones."""
+    seed: int = 0
+    """Decides the receivers at which sources are tried out."""

@@ -1,0 +1,158 @@
+"""The point sources of a field, out of spectra and geometry, in closed form: see docs/theory/radiance.md."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rf3dgs.core.errors import InputError
+from rf3dgs.core.frames import Pose
+from rf3dgs.field.images import HIGHEST_ORDER, sequences
+from rf3dgs.field.sources import PointSources, Rays
+from rf3dgs.geometry import Surfaces
+from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.splats.obstacles import Obstacles
+from rf3dgs.training.config import SourceConfig
+from rf3dgs.training.consolidation import consolidated, with_skins
+from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
+from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_marks, fit_reflection, glints, silent_planes
+from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, refined_planes, with_mirrors
+
+PROBES = 150
+PROBE_MARGIN = 0.5
+ROWS_AT_ONCE = 400_000
+
+
+@dataclass(frozen=True, eq=False)
+class SourceFit:
+    """Point sources and what they are at the training positions.
+
+    seen `[position]`: who sees the transmitter, as the spectra tell. rays: what reaches each position. found: what the
+    spectra show in the directions of the images, or None without images. plane_of `[N]`: the planes of the Gaussians,
+    or None without planes.
+    """
+
+    sources: PointSources
+    seen: Tensor
+    rays: list[Rays]
+    plane_of: Tensor | None = None
+    found: Glints | None = None
+
+
+def fit_sources(
+    spectra: Spectrum,
+    surfaces: Surfaces | None,
+    obstacles: Obstacles,
+    tx: Pose,
+    config: SourceConfig | None = None,
+) -> SourceFit:
+    """The transmitter at `tx` and its images in the planes of `surfaces`, fitted to `spectra` `[position, row, col]`.
+
+    Without `surfaces` there is the line of sight alone. Their pieces of large planes are made one, and mirrors that
+    they lack are added; the result says which Gaussians of `obstacles` belong to which plane.
+    """
+    config = SourceConfig() if config is None else config
+    if not 0 <= config.order <= HIGHEST_ORDER:
+        raise InputError(f"order must be from 0 to {HIGHEST_ORDER}; got {config.order}")
+    positions = spectra.pose.position
+    direct = PointSources.line_of_sight(tx.position, spectra.frequency)
+    direct, seen = fit_line_of_sight(direct, spectra)
+    direct = fit_opening(direct, seen, positions, obstacles)
+    if surfaces is None or config.order == 0 or not len(surfaces.planes):
+        return SourceFit(direct, seen, direct.rays_each(positions, obstacles, in_sight=seen))
+    probes = torch.cat((positions, _probes(positions, config.seed)))
+    surfaces = consolidated(surfaces, obstacles.means)
+    obstacles = replace(obstacles, labels=surfaces.plane_of)
+    sources = _known(direct, surfaces)
+    sources = with_images(sources, probes, replace(config, order=1))
+    peaks = peaks_of(spectra) if config.refine or config.complete else None
+    if peaks is not None and config.refine:
+        sources = _refined(sources, seen, peaks, positions, obstacles, config)
+    if peaks is not None and config.complete:
+        every = _fitted(sources, spectra, seen, obstacles)
+        every = with_images(every, probes, config)
+        mirrors = find_mirrors(every, every.rays_each(positions, obstacles, in_sight=seen), peaks, spectra, obstacles)
+        if mirrors:
+            sources = completed(sources, *with_mirrors(sources, mirrors))
+            assert sources.patches is not None
+            surfaces = replace(surfaces, planes=sources.planes, patches=sources.patches)
+            surfaces = replace(surfaces, plane_of=with_skins(surfaces, obstacles.means))
+            obstacles = replace(obstacles, labels=surfaces.plane_of)
+            sources = with_images(sources, probes, replace(config, order=1))
+            sources = _refined(sources, seen, peaks, positions, obstacles, config)
+    rays = sources.rays_each(positions, obstacles, in_sight=seen)
+    found = glints(sources, rays, spectra)
+    reflection = fit_reflection(found, len(sources.planes))
+    sources = replace(sources, reflection=reflection, marks=fit_marks(found, reflection))
+    sources = with_images(sources, probes, config, silent=silent_planes(found, len(sources.planes)))
+    sources = _strongest(sources, probes, obstacles, spectra, config)
+    rays = sources.rays_each(positions, obstacles, in_sight=seen)
+    return SourceFit(sources, seen, rays, surfaces.plane_of, found)
+
+
+def with_images(
+    sources: PointSources, probes: Tensor, config: SourceConfig, *, silent: Tensor | None = None
+) -> PointSources:
+    """The sources with all images up to `config.order` that reach one of the `probes` `[n, 3]` over surface.
+
+    Planes that are `silent` `[P]` mirror nothing.
+    """
+    assert sources.patches is not None
+    areas = sources.patches.areas
+    if silent is not None:
+        areas = torch.where(silent, -1.0, areas)
+    largest = areas.argsort(descending=True, stable=True)[: config.planes]
+    largest = largest[areas[largest] >= 0]
+    rows = sequences(len(largest), min(config.order, 2))
+    if config.order >= 3:
+        rows = torch.cat((rows, sequences(0, 0, third=torch.arange(min(config.largest, len(largest))))[1:]))
+    if len(largest):
+        rows = torch.where(rows >= 0, largest[rows.clamp_min(0)], -1)
+    kept = [torch.zeros(1, dtype=torch.long)]
+    for chunk in torch.arange(1, len(rows)).split(max(1, ROWS_AT_ONCE // len(probes))):
+        part = replace(sources, sequence=torch.cat((rows[:1], rows[chunk])))
+        kept.append(chunk[part.folded(probes)[1].any(0)[1:]])
+    return replace(sources, sequence=rows[torch.cat(kept)])
+
+
+def _known(direct: PointSources, surfaces: Surfaces) -> PointSources:
+    """The transmitter among the planes of the geometry, which reflect as dielectrics do, so far."""
+    reflection = torch.tensor(DIELECTRIC).expand(len(surfaces.planes), 3)
+    return replace(direct, planes=surfaces.planes, patches=surfaces.patches, reflection=reflection)
+
+
+def _fitted(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Obstacles) -> PointSources:
+    """The sources with what each plane reflects."""
+    rays = sources.rays_each(spectra.pose.position, obstacles, in_sight=seen)
+    return replace(sources, reflection=fit_reflection(glints(sources, rays, spectra), len(sources.planes)))
+
+
+def _refined(
+    sources: PointSources, seen: Tensor, peaks: Peaks, positions: Tensor, obstacles: Obstacles, config: SourceConfig
+) -> PointSources:
+    """The sources with their planes where the peaks of the images are."""
+    rays = sources.rays_each(positions, obstacles, in_sight=seen)
+    return replace(sources, planes=refined_planes(sources, rays, peaks, positions, config))
+
+
+def _probes(positions: Tensor, seed: int) -> Tensor:
+    """Receivers `[PROBES, 3]` drawn evenly in the box of the positions, a little widened."""
+    low, high = positions.amin(0) - PROBE_MARGIN, positions.amax(0) + PROBE_MARGIN
+    return low + (high - low) * torch.rand(PROBES, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def _strongest(
+    sources: PointSources, probes: Tensor, obstacles: Obstacles, spectra: Spectrum, config: SourceConfig
+) -> PointSources:
+    """The sources that somewhere come within `config.least_db` of the strongest peak, at most `config.most`."""
+    best = torch.zeros(len(sources))
+    floor = 10 ** (-config.least_db / 10)
+    peak = spectra.power.amax((-2, -1)).median()
+    for number, rays in enumerate(sources.rays_each(probes, obstacles)):
+        if not len(rays):
+            continue
+        top = spectra.power[number].max() if number < len(spectra) else torch.maximum(rays.power.max(), 0.01 * peak)
+        best = torch.maximum(best, torch.zeros_like(best).index_put((rays.index,), rays.power / top))
+    order = best[1:].argsort(descending=True, stable=True)[: config.most] + 1
+    kept = order[best[order] > floor].sort().values
+    return replace(sources, sequence=sources.sequence[torch.cat((torch.zeros(1, dtype=torch.long), kept))])
