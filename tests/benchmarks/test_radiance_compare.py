@@ -36,8 +36,8 @@ def test_a_share_is_better_where_it_is_higher():
 
 
 def test_equal_methods_are_told_apart_no_oftener_than_the_level_says():
-    # 200 pairs of equal methods; the two-way bootstrap is on the safe side, so 5 % is an upper bound. With p = 0.05 more
-    # than 20 of 200 come by chance in 0.1 % of runs.
+    # 200 pairs of equal methods; the two-way bootstrap is on the safe side, so 5 % is an upper bound. With p = 0.05
+    # more than 20 of 200 come by chance in 0.1 % of runs.
     told = [difference(scores(2 * k), scores(2 * k + 1), LOSS).verdict != "same" for k in range(200)]
     assert sum(told) <= 20
 

@@ -53,8 +53,9 @@ class Key:
     def path(self, folder: Path) -> Path:
         """Where the cell is kept."""
         trained = "" if self.trained == self.scene else f"-after-{self.trained}"
-        kind = Path(self.geometry).stem
-        name = f"{self.holdout}-{self.count:03d}-{self.seed}-{kind}-{self.model.replace(' ', '-')}{trained}.json"
+        name = (
+            f"{self.holdout}-{self.count:03d}-{self.seed}-{self.geometry}-{self.model.replace(' ', '-')}{trained}.json"
+        )
         return folder / "cells" / self.judge / f"{self.scene}-{self.preset}" / name
 
 
@@ -128,7 +129,7 @@ def make_cells(
     load = os.getloadavg()[0]
     reset_peak()
     clock = _Clock()
-    predictor = model.made(train, geometry, first.seed)
+    predictor = model.made(train, geometry, first.seed, truths[first.holdout].window.floor_db)
     fit = clock.lap()
     facts: dict[str, Any] = {"fit": fit, "peak_memory_bytes": peak_memory(), "load": load}
     if isinstance(predictor, RadioField):

@@ -32,7 +32,7 @@ from rf3dgs.splats.surface import sample_mesh
 from rf3dgs.training.checkpoint import fingerprint
 
 GRID = (180, 90)
-PLAN = "split.json"
+RANGE_DB = 80.0  # between the window's ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +53,16 @@ class Data:
         return pool.spectra[torch.isin(pool.index, torch.from_numpy(self.split.training(count, seed)))]
 
     def window(self) -> DbWindow:
-        """The dB window of every score: that of the whole pool, so that it depends on neither model nor cell."""
+        """The dB window of every score: that of the whole pool, so that it depends on neither model nor cell.
+
+        Levels more than 80 dB below the strongest count as the floor. Where surfaces scatter in narrow lobes a traced
+        spectrum has directions that no path reaches, and what lies between those and a weak path is not a level that
+        an instrument could tell.
+        """
         pool = self.dataset.train.spectra
         assert pool is not None
-        return window_of(pool)
+        found = window_of(pool)
+        return DbWindow(max(found.floor_db, found.ceil_db - RANGE_DB), found.ceil_db)
 
     def judged(self, judge: str, holdout: str, reason: str) -> tuple[Spectrum, Spectrum | None]:
         """The truth `[n, row, col]` of a hold-out and the second solve of some of it; a sealed one is logged."""
@@ -126,9 +132,7 @@ def _dataset(
     if folder.is_dir():
         held = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
         if held != wanted:
-            raise InputError(
-                f"{folder} holds data made with other settings; remove it, or give another --out"
-            )
+            raise InputError(f"{folder} holds data made with other settings; remove it, or give another --out")
         return Dataset.load(folder)
     parts = folder.with_name(f"{folder.name}.parts")
     spectra = _spectra(paths(), parts, count, progress)

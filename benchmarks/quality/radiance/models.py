@@ -30,15 +30,15 @@ class Model:
     def is_lookup(self) -> bool:
         return self.base in LOOKUPS
 
-    def settings(self, seed: int) -> dict[str, Any]:
+    def settings(self, seed: int, floor_db: float) -> dict[str, Any]:
         """All that decides its answer, as JSON can hold it."""
         if self.is_lookup:
             return {"neighbours": LOOKUPS[self.base]}
-        return json.loads(json.dumps(asdict(self.config(seed))))
+        return json.loads(json.dumps(asdict(self.config(seed, floor_db))))
 
-    def config(self, seed: int) -> RadioConfig:
-        """The settings of the radio stage; InputError for one that it does not have."""
-        changes = dict(self.changes)
+    def config(self, seed: int, floor_db: float) -> RadioConfig:
+        """The settings of the radio stage, whose window begins at `floor_db`; InputError for one it does not have."""
+        changes: dict[str, Any] = {"floor_db": floor_db} | dict(self.changes)
         preset = changes.pop("preset", None)
         config = RadioConfig(seed=seed) if preset is None else RadioConfig.preset(preset, seed=seed)
         if "model" in {item.name for item in fields(RadioConfig)}:
@@ -47,14 +47,14 @@ class Model:
             raise InputError(f"the radio stage of this version has no model {self.base!r}; judge another one")
         return changed(config, changes)
 
-    def made(self, train: Spectrum, geometry: Gaussians | None, seed: int) -> Predictor:
+    def made(self, train: Spectrum, geometry: Gaussians | None, seed: int, floor_db: float) -> Predictor:
         """The lookup over, or the field trained on, `train` `[position, row, col]`."""
         if self.is_lookup:
             count = LOOKUPS[self.base]
             return NearestNeighbour(train) if count == 1 else InverseDistance(train, neighbours=count)
         if geometry is None:
             raise InputError(f"the model {self.name!r} needs geometry; name photos, mesh or a .ply file")
-        return fit_radio(geometry, train, self.config(seed))
+        return fit_radio(geometry, train, self.config(seed, floor_db))
 
 
 def model_of(text: str) -> Model:
