@@ -69,11 +69,9 @@ def beats_baselines(results: Results, place: Place, subject: str) -> Iterator[Ch
         for score in scores:
             verdicts = {name: results.verdict(place, subject, name, score) for name in results.baselines(subject)}
             wrong = [f"{name} ({verdict})" for name, verdict in verdicts.items() if verdict not in wanted]
-            demand = "better than" if wanted == ("better",) else "not worse than"
-            if wrong:
-                yield Check(1, place, False, f"{score.label}: not {demand} {', '.join(wrong)}")
-            else:
-                yield Check(1, place, bool(verdicts), f"{score.label}: {demand} {', '.join(verdicts) or 'nothing'}")
+            demand = "better than" if wanted == ("better",) else "safe from"
+            text = f"not {demand} {', '.join(wrong)}" if wrong else f"{demand} {', '.join(verdicts) or 'nothing'}"
+            yield Check(1, place, bool(verdicts) and not wrong, f"{score.label}: {text}")
 
 
 def reaches(results: Results, place: Place, subject: str) -> Iterator[Check]:
