@@ -27,14 +27,19 @@ TX = torch.tensor([0.6, 0.8, 2.6])
 RECEIVERS = 60
 
 
-def write_paths(folder, count: int, *, noise: float = 0.0):
-    """Paths of receivers in a hall: the line of sight, its images in two walls, and a haze of weak directions."""
+def receivers() -> torch.Tensor:
     generator = torch.Generator().manual_seed(0)
-    place = torch.tensor([0.5, 0.5, 1.0]) + torch.tensor([13.0, 14.0, 1.0]) * torch.rand(200, 3, generator=generator)
+    low, size = torch.tensor([0.5, 0.5, 1.0]), torch.tensor([13.0, 14.0, 1.0])
+    return low + size * torch.rand(RECEIVERS, 3, generator=generator)
+
+
+def write_paths(folder, place: torch.Tensor, *, noise: float = 0.0):
+    """Paths to receivers in a hall: the line of sight, its images in two walls, and a haze of weak directions."""
+    generator = torch.Generator().manual_seed(1)
     haze = torch.nn.functional.normalize(torch.randn(400, 3, generator=generator), dim=-1)
     images = torch.stack((TX, TX * torch.tensor([-1.0, 1.0, 1.0]), TX * torch.tensor([1.0, -1.0, 1.0])))
     with PathsWriter(folder, 60e9, Pose(TX)) as writer:
-        for point in place[:count]:
+        for point in place:
             arrival = torch.cat((images - point, 3.0 * haze))
             length = arrival.norm(dim=-1)
             level = torch.cat((torch.tensor([1.0, 0.3, 0.2]), torch.full((400,), 0.01))) / length
@@ -62,14 +67,16 @@ def words(tmp_path, monkeypatch):
     """The words of a small table of lookups, whose second solve needs no tracer."""
     monkeypatch.setattr(data, "GRID", (36, 18))
     monkeypatch.setattr(compare, "RESAMPLES", 200)
-    monkeypatch.setattr(data, "paths_of", lambda *args: write_paths(tmp_path / "second.h5", args[2], noise=0.1))
-    first = write_paths(tmp_path / "first.h5", RECEIVERS)
+    monkeypatch.setattr(
+        data, "paths_of", lambda *args: write_paths(tmp_path / "second.h5", args[2].position, noise=0.1)
+    )
+    first = write_paths(tmp_path / "first.h5", receivers())
     return [
         *("--preset", "diffuse", "--paths", f"diffuse={first}", "--out", str(tmp_path / "out"), "--receivers"),
         *(
             str(RECEIVERS),
             "--again",
-            "40",
+            "4",
             "--held",
             "8",
             "8",

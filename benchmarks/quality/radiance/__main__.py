@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.quality.radiance.cells import SECOND, Key, Truth, commit, make_cells, make_second, read_cell
-from benchmarks.quality.radiance.data import Data, data_of, geometry_digest, geometry_of
+from benchmarks.quality.radiance.data import Data, data_of, geometry_digest, geometry_of, second_solve, spectra_at
 from benchmarks.quality.radiance.models import KNOWN, Model, model_of
 from benchmarks.quality.radiance.results import Results
 from benchmarks.quality.radiance.scenes import SITES, Setting
@@ -54,13 +54,11 @@ class Run:
 
         def truth(holdout: str) -> Truth:
             if holdout not in truths:
-                words = f"{', '.join(self.results.models)}; {holdout}; seeds {wish.seeds}; positions {wish.positions}"
-                reason = f"benchmarks.quality.radiance at {commit()}: {words}"
-                truths[holdout] = Truth.of(*data.judged(wish.judge, holdout, reason), window)
+                truths[holdout] = Truth.of(data.judged(wish.judge, holdout, self.reason), window)
             return truths[holdout]
 
         for holdout in wish.holdout:
-            self.second(setting, holdout, base, truth)
+            self.second(data, holdout, base, truth)
         for count in wish.positions:
             for seed in wish.seeds:
                 for model in self.models:
@@ -74,23 +72,37 @@ class Run:
         own = given.get(setting.preset) if setting.name == wish.scene else None
         return data_of(
             setting,
-            self.out / "data" / f"{setting.name}-{setting.preset}",
+            self.folder(setting),
             split,
             receivers=wish.receivers or site.receivers,
-            again=wish.again if setting.name == wish.scene else 0,
             paths=None if own is None else Path(own),
         )
 
-    def second(self, setting: Setting, holdout: str, base: dict[str, Any], truth: Any) -> None:
-        if not self.wish.again:
+    @property
+    def reason(self) -> str:
+        """Why the sealed positions are read, for the log."""
+        wish = self.wish
+        asked = f"models {', '.join(self.results.models)}; seeds {wish.seeds}; positions {wish.positions}"
+        return f"benchmarks.quality.radiance at {commit()}: {asked}"
+
+    def second(self, data: Data, holdout: str, base: dict[str, Any], truth: Any) -> None:
+        """The cell of the second solve of one hold-out."""
+        wish, setting = self.wish, data.setting
+        if not wish.again:
             return
-        key = Key(setting.name, setting.preset, "none", self.wish.judge, holdout, 0, 0, SECOND, setting.name)
-        identity = base | {"receivers": self.wish.again}
-        if read_cell(key.path(self.out), identity) is None:
-            make_second(key, truth(holdout), identity, self.out)
+        key = Key(setting.name, setting.preset, "none", wish.judge, holdout, 0, 0, SECOND, setting.name)
+        identity = base | {"receivers": wish.again}
+        if read_cell(key.path(self.out), identity) is None and not wish.only_read:
+            solved = second_solve(data, self.folder(setting), wish.judge, wish.again)
+            repeat = spectra_at(solved, wish.judge, holdout, self.reason, data.places(wish.judge, holdout))
+            if repeat is not None:
+                make_second(key, truth(holdout), repeat, identity, self.out)
         found = read_cell(key.path(self.out), identity)
         if found is not None:
             self.results.add_second(key, found)
+
+    def folder(self, setting: Setting) -> Path:
+        return self.out / "data" / f"{setting.name}-{setting.preset}"
 
     def cells(
         self, setting: Setting, before: Data, model: Model, count: int, seed: int, base: dict[str, Any], truth: Any
@@ -153,7 +165,7 @@ def asked(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--receivers", type=int, help="the first so many of the paths; the scene's own when missing")
     parser.add_argument("--held", nargs=4, type=int, metavar=("TEST", "REGION", "VALIDATION", "NEAR"), help="held out")
     parser.add_argument("--buffer", type=float, help="round both regions [m]")
-    parser.add_argument("--again", type=int, default=120, help="receivers solved a second time; 0 for none")
+    parser.add_argument("--again", type=int, default=20, help="positions of each hold-out solved again; 0 for none")
     parser.add_argument("--trained", choices=SITES, help="scene of the training spectra, where things have moved since")
     parser.add_argument("--again-models", nargs="+", default=[], help="models whose cells are made anew")
     parser.add_argument("--only-read", action="store_true", help="make no cell, show those that are there")

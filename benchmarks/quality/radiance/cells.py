@@ -61,17 +61,15 @@ class Key:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a hold-out is judged by: `spectra` `[n, row, col]`, their covariances, the second solve of some, the
-    window."""
+    """What a hold-out is judged by: `spectra` `[n, row, col]`, their covariances, the window."""
 
     spectra: Spectrum
     covariance: Tensor
-    repeat: Spectrum | None
     window: DbWindow
 
     @classmethod
-    def of(cls, spectra: Spectrum, repeat: Spectrum | None, window: DbWindow) -> "Truth":
-        return cls(spectra, beams.panel_covariance(spectra, ARRAY), repeat, window)
+    def of(cls, spectra: Spectrum, window: DbWindow) -> "Truth":
+        return cls(spectra, beams.panel_covariance(spectra, ARRAY), window)
 
     def scored(self, predictor: Predictor) -> Values:
         """Every position's scores of what a predictor renders there."""
@@ -80,17 +78,14 @@ class Truth:
             drawn = stack_spectra([predictor.render(pose, self.spectra.grid) for pose in poses])
             return score(self.spectra, drawn, self.covariance, self.window, ARRAY)
 
-    def second(self) -> Values:
-        """Scores of the second solve, NaN where there is none; the best that anything can be expected to reach."""
-        count = len(self.spectra)
-        if self.repeat is None:
-            return {}
-        apart = torch.cdist(self.repeat.pose.position.double(), self.spectra.pose.position.double())
+    def second(self, repeat: Spectrum) -> Values:
+        """Scores of the second solve `[m, row, col]` of some of the positions, NaN at the others."""
+        apart = torch.cdist(repeat.pose.position.double(), self.spectra.pose.position.double())
         place = apart.argmin(1)
-        found = score(self.spectra[place], self.repeat, self.covariance[place], self.window, ARRAY)
+        found = score(self.spectra[place], repeat, self.covariance[place], self.window, ARRAY)
         values = {}
         for name, value in found.items():
-            values[name] = np.full(count, math.nan)
+            values[name] = np.full(len(self.spectra), math.nan)
             values[name][place.numpy()] = value
         return values
 
@@ -140,11 +135,9 @@ def make_cells(
         _write(key, values, identity, facts | {"judging": clock.lap()}, folder)
 
 
-def make_second(key: Key, truth: Truth, identity: Mapping[str, Any], folder: Path) -> None:
-    """Write the cell of the second solve, where there is one."""
-    values = truth.second()
-    if values:
-        _write(key, values, identity, {"load": os.getloadavg()[0]}, folder)
+def make_second(key: Key, truth: Truth, repeat: Spectrum, identity: Mapping[str, Any], folder: Path) -> None:
+    """Write the cell of the second solve: the best that anything can be expected to reach."""
+    _write(key, truth.second(repeat), identity, {"load": os.getloadavg()[0]}, folder)
 
 
 def _write(key: Key, values: Values, identity: Mapping[str, Any], facts: Mapping[str, Any], folder: Path) -> None:

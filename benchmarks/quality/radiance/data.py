@@ -8,11 +8,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from benchmarks.quality.radiance.scenes import BEFORE, Setting, paths_of
-from benchmarks.quality.radiance.split import PARTS, Split, SplitConfig, split_of
+from benchmarks.quality.radiance.split import HOLDOUTS, PARTS, Split, SplitConfig, split_of
 from rf3dgs.channel.io import PathsReader
 from rf3dgs.channel.paths import Paths
 from rf3dgs.cli.chain import REPEAT_RAYS, REPEAT_SEED
@@ -37,12 +38,10 @@ RANGE_DB = 80.0  # between the window's ends
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """A scene under a preset: `dataset` with the sealed test, the `second` solve of some of it or None, the `split`,
-    and a `digest` of dataset and split."""
+    """A scene under a preset: `dataset` with the sealed test, the `split`, and a `digest` of both."""
 
     setting: Setting
     dataset: Dataset
-    second: Dataset | None
     split: Split
     digest: str
 
@@ -64,12 +63,15 @@ class Data:
         found = window_of(pool)
         return DbWindow(max(found.floor_db, found.ceil_db - RANGE_DB), found.ceil_db)
 
-    def judged(self, judge: str, holdout: str, reason: str) -> tuple[Spectrum, Spectrum | None]:
-        """The truth `[n, row, col]` of a hold-out and the second solve of some of it; a sealed one is logged."""
-        wanted = self.dataset.pose.position[torch.from_numpy(self.split.part(judge, holdout))]
-        truth = _taken(self.dataset, judge, holdout, reason, wanted)
-        assert truth is not None
-        return truth, None if self.second is None else _taken(self.second, judge, holdout, reason, wanted)
+    def judged(self, judge: str, holdout: str, reason: str) -> Spectrum:
+        """The truth `[n, row, col]` of a hold-out; a sealed one is logged with the reason."""
+        found = spectra_at(self.dataset, judge, holdout, reason, self.places(judge, holdout))
+        assert found is not None
+        return found
+
+    def places(self, judge: str, holdout: str) -> Tensor:
+        """The positions `[n, 3]` [m] of a hold-out."""
+        return self.dataset.pose.position[torch.from_numpy(self.split.part(judge, holdout))]
 
 
 def data_of(
@@ -78,45 +80,46 @@ def data_of(
     config: SplitConfig,
     *,
     receivers: int,
-    again: int = 0,
     paths: Path | None = None,
     progress: Progress | None = None,
 ) -> Data:
     """The spectra of a setting in `folder`, traced and made where they are not there yet.
 
-    receivers: the first so many. again: of those the first so many are solved a second time, with another seed and
-    number of rays. paths: a folder of `rf3dgs trace` to take the first solve from. Raises InputError where the folder
-    holds other data.
+    receivers: the first so many. paths: a folder of `rf3dgs trace` to take them from. Raises InputError where the
+    folder holds other data.
     """
     progress = Console() if progress is None else progress
-    plan = {"setting": asdict(setting), "grid": list(GRID), "split": asdict(config)}
+    plan = {"setting": asdict(setting), "grid": list(GRID), "split": asdict(config), "receivers": receivers}
+
+    def traced() -> Path:
+        return paths or paths_of(setting, folder / "first.paths", setting.receivers(receivers), TraceConfig(), progress)
 
     def roles_of(positions: Tensor) -> tuple[str, ...]:
         return split_of(positions, config).roles
 
-    def first() -> Path:
-        return paths or paths_of(setting, folder / "first.paths", receivers, TraceConfig(), progress)
-
-    dataset = _dataset(folder / "dataset", plan | {"receivers": receivers}, first, receivers, roles_of, progress)
+    dataset = _dataset(folder / "dataset", plan, traced, receivers, roles_of, progress)
     split = split_of(dataset.pose.position, config)
     if split.roles != dataset.roles:
         raise DataError(f"{folder}: the roles of the dataset are not those of the split; remove the folder")
-
-    def roles_there(positions: Tensor) -> tuple[str, ...]:
-        apart = torch.cdist(positions.double(), dataset.pose.position.double()).min(1)
-        if bool((apart.values > 1e-3).any()):
-            raise DataError(f"{folder}: the second solve stands at other positions than the first; remove the folder")
-        return tuple(dataset.roles[place] for place in apart.indices.tolist())
-
-    def other() -> Path:
-        again_config = TraceConfig(seed=REPEAT_SEED, rays=round(TraceConfig().rays * REPEAT_RAYS))
-        return paths_of(setting, folder / "second.paths", again, again_config, progress)
-
-    second = None
-    if again:
-        second = _dataset(folder / "second", plan | {"receivers": again}, other, again, roles_there, progress)
     digest = hashlib.sha256((folder / "dataset" / "spectra.h5").read_bytes() + json.dumps(split.names).encode())
-    return Data(setting, dataset, second, split, digest.hexdigest())
+    return Data(setting, dataset, split, digest.hexdigest())
+
+
+def second_solve(data: Data, folder: Path, judge: str, count: int, *, progress: Progress | None = None) -> Dataset:
+    """The first `count` positions of each hold-out traced again with another seed and number of rays, in `folder`."""
+    progress = Console() if progress is None else progress
+    index = np.sort(np.concatenate([data.split.part(judge, holdout)[:count] for holdout in HOLDOUTS])).tolist()
+    config = TraceConfig(seed=REPEAT_SEED, rays=round(TraceConfig().rays * REPEAT_RAYS))
+    plan = {"of": data.digest, "judge": judge, "count": count, "trace": asdict(config)}
+
+    def traced() -> Path:
+        rx = data.dataset.pose[torch.tensor(index)]
+        return paths_of(data.setting, folder / f"second-{judge}.paths", rx, config, progress)
+
+    def roles_of(positions: Tensor) -> tuple[str, ...]:
+        return tuple(data.dataset.roles[place] for place in index)
+
+    return _dataset(folder / f"second-{judge}", plan, traced, len(index), roles_of, progress)
 
 
 def _dataset(
@@ -142,7 +145,7 @@ def _dataset(
     return made
 
 
-def _taken(dataset: Dataset, judge: str, holdout: str, reason: str, wanted: Tensor) -> Spectrum | None:
+def spectra_at(dataset: Dataset, judge: str, holdout: str, reason: str, wanted: Tensor) -> Spectrum | None:
     """The spectra at the positions `wanted` `[n, 3]`, in the dataset's order; None where there are none."""
     name = PARTS[judge, holdout]
     part = dataset.open_test(reason, name) if judge == "test" else dataset.validation

@@ -1,7 +1,7 @@
 """The scenes of the table: where the transmitter and the receivers are, and which surfaces the geometry covers."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -93,9 +93,8 @@ class Site:
     around: float | None = None
 
 
-def paths_of(setting: Setting, folder: Path, count: int, config: TraceConfig, progress: Progress) -> Path:
-    """The folder of paths to the first `count` receivers, as `rf3dgs trace` writes it; a killed run goes on."""
-    rx = setting.receivers(count)
+def paths_of(setting: Setting, folder: Path, rx: Pose, config: TraceConfig, progress: Progress) -> Path:
+    """The folder of paths to receivers `rx` `[rx]`, as `rf3dgs trace` writes it; a killed run goes on."""
     scene, config = preset_of(setting.preset).applied(setting.scene(), config)
     job = TraceJob(
         scene=without_looks(scene),
@@ -103,7 +102,7 @@ def paths_of(setting: Setting, folder: Path, count: int, config: TraceConfig, pr
         rx=rx,
         frequency=config.frequency or scene.frequency,
         config=config,
-        rule=asdict(ReceiverConfig(count=count)) | {"site": setting.name},
+        rule={"site": setting.name},
     )
     run_job(job, folder, progress=progress)
     return folder
