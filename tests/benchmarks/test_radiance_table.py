@@ -235,6 +235,18 @@ def test_a_model_that_is_better_everywhere_passes_and_one_that_loses_a_score_fai
     assert failed == ["Path gain: not better than nearest (same)", "Delay: not safe from nearest (worse)"]
 
 
+def test_a_variant_can_be_what_others_are_judged_against():
+    results = planted(0.05)
+    results.against = ["nearest", "mirror"]
+    assert results.baselines("paper") == ["nearest", "mirror"]
+    assert results.baselines("mirror") == ["nearest"]
+
+
+def test_a_baseline_that_is_not_in_the_table_is_refused(words, capsys):
+    assert command.main([*words, "--against", "nearest", "spam"]) == 2
+    assert "spam is to be judged against, but is no model of this table" in capsys.readouterr().err
+
+
 def test_a_seed_that_is_missing_is_a_failed_check():
     found = list(beats_baselines(planted(0.05, seeds=(0, 2)), PLACE, "mirror"))
     assert [check.text for check in found if not check.passed] == ["mirror: no cell for seed 1"]

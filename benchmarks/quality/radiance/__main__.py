@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmarks.quality.radiance.cells import SECOND, Key, Truth, commit, make_cells, make_second, read_cell
 from benchmarks.quality.radiance.data import Data, data_of, geometry_digest, geometry_of, second_solve, spectra_at
-from benchmarks.quality.radiance.models import KNOWN, Model, model_of
+from benchmarks.quality.radiance.models import KNOWN, LOOKUPS, Model, model_of
 from benchmarks.quality.radiance.results import Results
 from benchmarks.quality.radiance.scenes import SITES, Setting
 from benchmarks.quality.radiance.split import HOLDOUTS, JUDGES, SplitConfig
@@ -38,7 +38,11 @@ class Run:
         for model in self.models:
             model.settings(0, -150.0)
         self.geometries: dict[str, Gaussians] = {}
-        self.results = Results(names, wish.judge, Path(wish.geometry).stem, wish.seeds)
+        unknown = [name for name in wish.against or () if name not in names]
+        if unknown:
+            raise InputError(f"{', '.join(unknown)} is to be judged against, but is no model of this table")
+        against = wish.against or [*LOOKUPS, "paper"]
+        self.results = Results(names, wish.judge, Path(wish.geometry).stem, wish.seeds, against)
 
     def preset(self, preset: str) -> None:
         """Make the missing cells of one preset, model by model, and gather all."""
@@ -158,6 +162,7 @@ def asked(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--models", nargs="+", default=["nearest", "idw4", "idw8", "paper"], help=", ".join(KNOWN))
     parser.add_argument("--variants", nargs="+", default=[], metavar="NAME=BASE,SETTING=VALUE", help="ablations")
+    parser.add_argument("--against", nargs="+", help="the baselines; the lookups and paper when missing")
     parser.add_argument("--geometry", default="photos", help="photos, mesh, or a .ply file")
     parser.add_argument("--mesh-count", type=int, default=100_000, help="Gaussians on a mesh")
     parser.add_argument("--judge", choices=JUDGES, default="validation", help='"test" reads the sealed positions')

@@ -27,12 +27,14 @@ class Results:
     """What was read: scores by place, model and seed, second solves by place without a count, and facts of cells.
 
     models: in the order of the columns. judge and geometry: of all of them. wanted: the seeds that were asked for.
+    against: the models that others are judged against.
     """
 
     models: Sequence[str]
     judge: str
     geometry: str
     wanted: Sequence[int]
+    against: Sequence[str] = (*LOOKUPS, "paper")
     values: dict[Place, dict[str, dict[int, Values]]] = field(default_factory=dict)
     seconds: dict[tuple[str, str, str], Values] = field(default_factory=dict)
     facts: list[dict[str, Any]] = field(default_factory=list)
@@ -55,8 +57,9 @@ class Results:
         return [name for name in self.models if name not in LOOKUPS]
 
     def baselines(self, subject: str) -> list[str]:
-        """What a model is judged against: the lookups, and the paper's model."""
-        return [name for name in self.models if name in LOOKUPS or (name == "paper" and subject != "paper")]
+        """What a model is judged against; a baseline that is no lookup itself, against lookups alone."""
+        against = LOOKUPS if subject in self.against else self.against
+        return [name for name in self.models if name in against]
 
     def seeds(self, place: Place, *models: str) -> list[int]:
         return in_common(self.values.get(place, {}), models)

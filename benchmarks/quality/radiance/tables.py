@@ -11,7 +11,7 @@ from benchmarks.quality.radiance.compare import MUST_NOT_LOSE, MUST_WIN, ROWS, E
 from benchmarks.quality.radiance.results import Place, Results
 
 WIDTH = 80
-LABEL = 32
+LABEL = 34
 COLUMN = 8
 VERDICTS = (*MUST_WIN, *MUST_NOT_LOSE)
 
@@ -40,10 +40,10 @@ def _numbers(results: Results, place: Place) -> Iterator[str]:
     fit = (WIDTH - LABEL) // COLUMN - 1
     for start in range(0, max(len(results.models), 1), fit):
         models = list(results.models[start : start + fit])
-        yield f"{'':{LABEL}}" + "".join(f"{name[: COLUMN - 1]:>{COLUMN}}" for name in (*models, "2 solves"))
+        yield f"{'':{LABEL}}" + "".join(f"{name[: COLUMN - 1]:>{COLUMN}}" for name in (*models, "2nd"))
         for score in ROWS:
             cells = [results.estimate(place, model, score) for model in models] + [results.second(place, score)]
-            label = f"{score.label} [{score.unit}]"[: LABEL - 1]
+            label = f"{score.label} [{score.unit}]"
             yield f"{label:{LABEL}}" + "".join(
                 f"{'-' if cell is None else score.text(cell.value):>{COLUMN}}" for cell in cells
             )
@@ -56,7 +56,7 @@ def _numbers(results: Results, place: Place) -> Iterator[str]:
         yield f"{subject[:14] + ' against':{LABEL}}" + "".join(f"{name[: COLUMN - 1]:>{COLUMN}}" for name in baselines)
         for score in VERDICTS:
             verdicts = [results.verdict(place, subject, name, score) for name in baselines]
-            label = f"  {score.label}"[: LABEL - 1]
+            label = f"  {score.label}"
             yield f"{label:{LABEL}}" + "".join(f"{verdict:>{COLUMN}}" for verdict in verdicts)
 
 
