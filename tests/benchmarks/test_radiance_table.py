@@ -174,7 +174,9 @@ def test_a_field_is_judged_like_a_lookup_and_its_cost_is_kept(words, tmp_path):
     page = (tmp_path / "out" / "lobby-floor-validation.md").read_text()
     assert "quick minus" in page
     assert "second solve" in page
-    assert str(tmp_path) not in json.dumps(cell)
+    assert "--paths diffuse=first.h5" in page
+    report = (tmp_path / "out" / "lobby-floor-validation.json").read_text()
+    assert not [text for text in (json.dumps(cell), page, report) if str(tmp_path) in text]
 
 
 def test_a_model_that_fails_leaves_its_cells_empty_and_is_a_failed_check(words, capsys):

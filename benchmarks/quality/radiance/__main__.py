@@ -10,7 +10,6 @@ import json
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +148,12 @@ class Run:
         return self.geometries[site]
 
 
+def without_folder(word: str) -> str:
+    """A word of the command line as a page may show it: of a file its name alone."""
+    head, equals, path = word.rpartition("=")
+    return f"{head}{equals}{Path(path).name}" if "/" in path else word
+
+
 def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
@@ -190,14 +195,15 @@ def main(words: Sequence[str] | None = None) -> int:
         say(f"radiance: {error}")
         return 2
     results = run.results
-    command = shlex.join(["python", "-m", "benchmarks.quality.radiance", *(sys.argv[1:] if words is None else words)])
+    given = [without_folder(word) for word in (sys.argv[1:] if words is None else words)]
+    command = shlex.join(["python", "-m", "benchmarks.quality.radiance", *given])
     trained = "" if wish.trained is None else f"-after-{wish.trained}"
     name = f"{wish.scene}-{Path(wish.geometry).stem}-{wish.judge}{trained}"
     text = text_of(results)
     write_whole(wish.out / f"{name}.txt", (text + "\n").encode())
     write_whole(wish.out / f"{name}.md", page_of(results, command).encode())
-    numbers = numbers_of(results) | {"wish": {k: str(v) for k, v in vars(wish).items()}, "facts": results.facts}
-    write_whole(wish.out / f"{name}.json", (json.dumps(numbers, indent=1, default=asdict) + "\n").encode())
+    numbers = {"command": command} | numbers_of(results) | {"facts": results.facts}
+    write_whole(wish.out / f"{name}.json", (json.dumps(numbers, indent=1) + "\n").encode())
     print(text)
     print(f"\n{wish.out / name}.md has all intervals, .json all numbers")
     return 0
