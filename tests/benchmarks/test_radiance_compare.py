@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from benchmarks.quality.radiance import compare
 from benchmarks.quality.radiance.compare import MUST_WIN, PEAK_MEAN, difference, estimate, in_common
 
 from rf3dgs.evaluation.scores import SCORE
@@ -35,7 +36,8 @@ def test_a_share_is_better_where_it_is_higher():
     assert found.estimate.value == pytest.approx(25.0)
 
 
-def test_equal_methods_are_told_apart_no_oftener_than_the_level_says():
+def test_equal_methods_are_told_apart_no_oftener_than_the_level_says(monkeypatch):
+    monkeypatch.setattr(compare, "RESAMPLES", 500)
     # 200 pairs of equal methods; the two-way bootstrap is on the safe side, so 5 % is an upper bound. With p = 0.05
     # more than 20 of 200 come by chance in 0.1 % of runs.
     told = [difference(scores(2 * k), scores(2 * k + 1), LOSS).verdict != "same" for k in range(200)]
@@ -50,7 +52,8 @@ def test_an_improvement_that_one_lucky_seed_makes_is_not_significant():
     assert difference(model, baseline, LOSS).verdict == "same"
 
 
-def test_the_interval_of_a_mean_covers_the_truth_about_as_often_as_it_says():
+def test_the_interval_of_a_mean_covers_the_truth_about_as_often_as_it_says(monkeypatch):
+    monkeypatch.setattr(compare, "RESAMPLES", 500)
     inside = 0
     for k in range(200):
         values = np.random.default_rng(k).normal(1.0, 1.0, (1, 100))

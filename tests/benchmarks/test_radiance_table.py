@@ -189,6 +189,26 @@ def test_a_model_that_fails_leaves_its_cells_empty_and_is_a_failed_check(words, 
     assert "no cell for seed 0" in captured.out
 
 
+def test_a_model_may_be_trained_on_what_was_before_things_moved(words, tmp_path, monkeypatch):
+    def traced(setting, folder, rx, config, progress):
+        return write_paths(tmp_path / f"{setting.name}.h5", rx.position, noise=9.0 * (setting.name == "lobby-moved"))
+
+    monkeypatch.setattr(data, "paths_of", traced)
+
+    def drawn(setting, count):
+        return Pose(receivers().flip(0) if setting.name == "lobby" else receivers())
+
+    monkeypatch.setattr(data.Setting, "receivers", drawn)
+    moved = [*words[4:], "--scene", "lobby-moved", "--again", "0", "--positions", "20", "--seeds", "0"]
+    assert command.main(moved) == 0
+    assert command.main([*moved, "--trained", "lobby-before"]) == 0
+    cell = {name.rsplit("/", 1)[1]: json.loads(text)["values"]["rmse_db"] for name, text in stored(tmp_path).items()}
+    fresh, stale = (cell[f"random-020-0-none-nearest{end}.json"] for end in ("", "-after-lobby-before"))
+    assert np.mean(stale) != np.mean(fresh)
+    assert (tmp_path / "out" / "lobby-moved-photos-validation-after-lobby-before.md").exists()
+    assert command.main([*moved, "--trained", "lobby"]) == 2  # whose receivers are others
+
+
 def test_other_settings_for_data_that_are_there_are_refused(words, capsys):
     assert command.main(words) == 0
     assert command.main([*words, "--buffer", "0.5"]) == 2

@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from benchmarks.quality.radiance.cells import SECOND, Key, Truth, commit, make_cells, make_second, read_cell
 from benchmarks.quality.radiance.data import Data, data_of, geometry_digest, geometry_of, second_solve, spectra_at
 from benchmarks.quality.radiance.models import KNOWN, LOOKUPS, Model, model_of
@@ -49,7 +51,7 @@ class Run:
         setting = Setting(wish.scene, preset)
         data = self.data(setting)
         before = data if wish.trained is None else self.data(Setting(wish.trained, preset))
-        if before.split.names != data.split.names:
+        if before.split != data.split or not torch.equal(before.dataset.pose.position, data.dataset.pose.position):
             raise InputError(f"{wish.trained!r} and {wish.scene!r} have other receivers; nothing can be compared")
         window = before.window()
         truths: dict[str, Truth] = {}

@@ -128,7 +128,7 @@ def make_cells(
     fit = clock.lap()
     facts: dict[str, Any] = {"fit": fit, "peak_memory_bytes": peak_memory(), "load": load}
     if isinstance(predictor, RadioField):
-        facts |= {"gaussians": len(predictor.surface), "meta": dict(predictor.meta)}
+        facts |= {"gaussians": len(predictor.solidity), "meta": dict(predictor.meta)}
     for key in keys:
         clock = _Clock()
         values = truths[key.holdout].scored(predictor)
