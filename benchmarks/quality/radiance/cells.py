@@ -1,0 +1,189 @@
+"""Cells of the table: one model trained on one set of positions and judged by one hold-out, a JSON file each.
+
+A cell holds every position's scores, what it cost, and what it was made from; one that is there and was made from the
+same is never made again.
+"""
+
+import json
+import math
+import os
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.quality.radiance.models import Model
+from rf3dgs.channel.arrays import planar_array
+from rf3dgs.core.files import write_whole
+from rf3dgs.evaluation import beams
+from rf3dgs.evaluation.protocol import Predictor, refuse_leak, score
+from rf3dgs.evaluation.provenance import versions
+from rf3dgs.field.radio_field import RadioField
+from rf3dgs.spectra.codec import DbWindow
+from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
+from rf3dgs.splats.gaussians import Gaussians
+
+SECOND = "second solve"
+ARRAY = planar_array(8, 8, pattern="patch")
+Values = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Key:
+    """Which cell: `count` training positions drawn by `seed`; `geometry` is "none" for lookups; `trained` names the
+    scene that the training spectra are of, which is `scene` unless things have moved."""
+
+    scene: str
+    preset: str
+    geometry: str
+    judge: str
+    holdout: str
+    count: int
+    seed: int
+    model: str
+    trained: str
+
+    def path(self, folder: Path) -> Path:
+        """Where the cell is kept."""
+        trained = "" if self.trained == self.scene else f"-after-{self.trained}"
+        name = (
+            f"{self.holdout}-{self.count:03d}-{self.seed}-{self.geometry}-{self.model.replace(' ', '-')}{trained}.json"
+        )
+        return folder / "cells" / self.judge / f"{self.scene}-{self.preset}" / name
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a hold-out is judged by: `spectra` `[n, row, col]`, their covariances, the window."""
+
+    spectra: Spectrum
+    covariance: Tensor
+    window: DbWindow
+
+    @classmethod
+    def of(cls, spectra: Spectrum, window: DbWindow) -> "Truth":
+        return cls(spectra, beams.panel_covariance(spectra, ARRAY), window)
+
+    def scored(self, predictor: Predictor) -> Values:
+        """Every position's scores of what a predictor renders there."""
+        with torch.no_grad():
+            poses = [self.spectra.pose[index] for index in range(len(self.spectra))]
+            drawn = stack_spectra([predictor.render(pose, self.spectra.grid) for pose in poses])
+            return score(self.spectra, drawn, self.covariance, self.window, ARRAY)
+
+    def second(self, repeat: Spectrum) -> Values:
+        """Scores of the second solve `[m, row, col]` of some of the positions, NaN at the others."""
+        apart = torch.cdist(repeat.pose.position.double(), self.spectra.pose.position.double())
+        place = apart.argmin(1)
+        found = score(self.spectra[place], repeat, self.covariance[place], self.window, ARRAY)
+        values = {}
+        for name, value in found.items():
+            values[name] = np.full(len(self.spectra), math.nan)
+            values[name][place.numpy()] = value
+        return values
+
+
+def read_cell(path: Path, identity: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The cell in a file, None where there is none or it was made from something else."""
+    try:
+        cell = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    wanted = json.loads(json.dumps(identity))
+    return cell if isinstance(cell, dict) and cell.get("identity") == wanted else None
+
+
+def values_of(cell: Mapping[str, Any]) -> Values:
+    """Scores by name `[position]`, NaN where one does not apply."""
+    return {
+        name: np.array([math.nan if value is None else value for value in row], dtype=np.float64)
+        for name, row in cell["values"].items()
+    }
+
+
+def make_cells(
+    keys: Sequence[Key],
+    model: Model,
+    train: Spectrum,
+    truths: Mapping[str, Truth],
+    geometry: Gaussians | None,
+    identity: Mapping[str, Any],
+    folder: Path,
+) -> None:
+    """Train a model once and write the cells `keys`, which differ in the hold-out alone."""
+    first = keys[0]
+    for key in keys:
+        refuse_leak(train.pose.position, truths[key.holdout].spectra.pose.position)
+    load = os.getloadavg()[0]
+    reset_peak()
+    clock = _Clock()
+    predictor = model.made(train, geometry, first.seed, truths[first.holdout].window.floor_db)
+    fit = clock.lap()
+    facts: dict[str, Any] = {"fit": fit, "peak_memory_bytes": peak_memory(), "load": load}
+    if isinstance(predictor, RadioField):
+        facts |= {"gaussians": len(predictor.solidity), "meta": dict(predictor.meta)}
+    for key in keys:
+        clock = _Clock()
+        values = truths[key.holdout].scored(predictor)
+        _write(key, values, identity, facts | {"judging": clock.lap()}, folder)
+
+
+def make_second(key: Key, truth: Truth, repeat: Spectrum, identity: Mapping[str, Any], folder: Path) -> None:
+    """Write the cell of the second solve: the best that anything can be expected to reach."""
+    _write(key, truth.second(repeat), identity, {"load": os.getloadavg()[0]}, folder)
+
+
+def _write(key: Key, values: Values, identity: Mapping[str, Any], facts: Mapping[str, Any], folder: Path) -> None:
+    cell = {
+        "key": asdict(key),
+        "identity": identity,
+        **facts,
+        "made": {"when": datetime.now(UTC).isoformat(timespec="seconds"), "commit": commit(), "versions": versions()},
+        "values": {name: [None if math.isnan(v) else float(v) for v in row] for name, row in values.items()},
+    }
+    write_whole(key.path(folder), (json.dumps(cell, indent=1, allow_nan=False) + "\n").encode())
+
+
+class _Clock:
+    def __init__(self) -> None:
+        self.wall, self.cpu = time.perf_counter(), time.process_time()
+
+    def lap(self) -> dict[str, float]:
+        return {"seconds": time.perf_counter() - self.wall, "cpu_seconds": time.process_time() - self.cpu}
+
+
+def commit() -> str:
+    """The commit of the source, with "+changes" where files differ from it; "unknown" outside a repository."""
+    here = Path(__file__).parent
+
+    def git(*words: str) -> str:
+        found = subprocess.run(["git", *words], cwd=here, capture_output=True, text=True, check=False)
+        return found.stdout.strip() if found.returncode == 0 else ""
+
+    name = git("rev-parse", "--short=12", "HEAD")
+    return (name + ("+changes" if git("status", "--porcelain", "-uno") else "")) if name else "unknown"
+
+
+def reset_peak() -> None:
+    """Let the system count this process's peak memory from now on, where it can (Linux)."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    except OSError:
+        return
+
+
+def peak_memory() -> int | None:
+    """Peak resident memory [byte] since `reset_peak`; None where the system does not tell."""
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    peaks = [int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM")]
+    return peaks[0] if peaks else None

@@ -1,0 +1,226 @@
+"""The data of the table: paths, spectra, splits and geometry, made once and found again."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.quality.radiance.scenes import BEFORE, Setting, paths_of
+from benchmarks.quality.radiance.split import HOLDOUTS, PARTS, Split, SplitConfig, split_of
+from rf3dgs.channel.io import PathsReader
+from rf3dgs.channel.paths import Paths
+from rf3dgs.cli.chain import REPEAT_RAYS, REPEAT_SEED
+from rf3dgs.core.errors import DataError, InputError
+from rf3dgs.core.files import write_whole
+from rf3dgs.core.grids import equirect_grid
+from rf3dgs.core.progress import Console, Progress
+from rf3dgs.data.dataset import Dataset
+from rf3dgs.data.stream import stream_spectra
+from rf3dgs.propagation.config import TraceConfig
+from rf3dgs.spectra.codec import DbWindow, window_of
+from rf3dgs.spectra.scan import spectrum_of
+from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.splats.ply import read_ply, write_ply
+from rf3dgs.splats.surface import sample_mesh
+from rf3dgs.training.checkpoint import fingerprint
+
+GRID = (180, 90)
+RANGE_DB = 80.0  # between the window's ends
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """A scene under a preset: `dataset` with the sealed test, the `split`, and a `digest` of both."""
+
+    setting: Setting
+    dataset: Dataset
+    split: Split
+    digest: str
+
+    def training(self, count: int, seed: int) -> Spectrum:
+        """The spectra `[count, row, col]` of the training positions."""
+        pool = self.dataset.train
+        assert pool.spectra is not None
+        return pool.spectra[torch.isin(pool.index, torch.from_numpy(self.split.training(count, seed)))]
+
+    def window(self) -> DbWindow:
+        """The dB window of every score: that of the whole pool, so that it depends on neither model nor cell.
+
+        Levels more than 80 dB below the strongest count as the floor. Where surfaces scatter in narrow lobes a traced
+        spectrum has directions that no path reaches, and what lies between those and a weak path is not a level that
+        an instrument could tell.
+        """
+        pool = self.dataset.train.spectra
+        assert pool is not None
+        found = window_of(pool)
+        return DbWindow(max(found.floor_db, found.ceil_db - RANGE_DB), found.ceil_db)
+
+    def judged(self, judge: str, holdout: str, reason: str) -> Spectrum:
+        """The truth `[n, row, col]` of a hold-out; a sealed one is logged with the reason."""
+        found = spectra_at(self.dataset, judge, holdout, reason, self.places(judge, holdout))
+        assert found is not None
+        return found
+
+    def places(self, judge: str, holdout: str) -> Tensor:
+        """The positions `[n, 3]` [m] of a hold-out."""
+        return self.dataset.pose.position[torch.from_numpy(self.split.part(judge, holdout))]
+
+
+def data_of(
+    setting: Setting,
+    folder: Path,
+    config: SplitConfig,
+    *,
+    receivers: int,
+    paths: Path | None = None,
+    progress: Progress | None = None,
+) -> Data:
+    """The spectra of a setting in `folder`, traced and made where they are not there yet.
+
+    receivers: the first so many. paths: a folder of `rf3dgs trace` to take them from. Raises InputError where the
+    folder holds other data.
+    """
+    progress = Console() if progress is None else progress
+    plan = {"setting": asdict(setting), "grid": list(GRID), "split": asdict(config), "receivers": receivers}
+
+    def traced() -> Path:
+        return paths or paths_of(setting, folder / "first.paths", setting.receivers(receivers), TraceConfig(), progress)
+
+    def roles_of(positions: Tensor) -> tuple[str, ...]:
+        return split_of(positions, config).roles
+
+    dataset = _dataset(folder / "dataset", plan, traced, receivers, roles_of, progress)
+    split = split_of(dataset.pose.position, config)
+    if split.roles != dataset.roles:
+        raise DataError(f"{folder}: the roles of the dataset are not those of the split; remove the folder")
+    digest = hashlib.sha256((folder / "dataset" / "spectra.h5").read_bytes() + json.dumps(split.names).encode())
+    return Data(setting, dataset, split, digest.hexdigest())
+
+
+def second_solve(data: Data, folder: Path, judge: str, count: int, *, progress: Progress | None = None) -> Dataset:
+    """The first `count` positions of each hold-out traced again with another seed and number of rays, in `folder`."""
+    progress = Console() if progress is None else progress
+    index = np.sort(np.concatenate([data.split.part(judge, holdout)[:count] for holdout in HOLDOUTS])).tolist()
+    config = TraceConfig(seed=REPEAT_SEED, rays=round(TraceConfig().rays * REPEAT_RAYS))
+    plan = {"of": data.digest, "judge": judge, "count": count, "trace": asdict(config)}
+
+    def traced() -> Path:
+        rx = data.dataset.pose[torch.tensor(index)]
+        return paths_of(data.setting, folder / f"second-{judge}.paths", rx, config, progress)
+
+    def roles_of(positions: Tensor) -> tuple[str, ...]:
+        return tuple(data.dataset.roles[place] for place in index)
+
+    return _dataset(folder / f"second-{judge}", plan, traced, len(index), roles_of, progress)
+
+
+def _dataset(
+    folder: Path,
+    plan: Mapping[str, Any],
+    paths: Callable[[], Path],
+    count: int,
+    roles_of: Callable[[Tensor], tuple[str, ...]],
+    progress: Progress,
+) -> Dataset:
+    """The dataset in `folder`, made of the first `count` receivers of the paths that `paths` finds or traces."""
+    wanted, file = json.loads(json.dumps(plan)), folder.with_name(f"{folder.name}.plan.json")
+    if folder.is_dir():
+        held = json.loads(file.read_text(encoding="utf-8")) if file.exists() else None
+        if held != wanted:
+            raise InputError(f"{folder} holds data made with other settings; remove it, or give another --out")
+        return Dataset.load(folder)
+    parts = folder.with_name(f"{folder.name}.parts")
+    spectra = _spectra(paths(), parts, count, progress)
+    write_whole(file, (json.dumps(wanted, indent=1) + "\n").encode())
+    made = Dataset((), spectra, roles=roles_of(spectra.pose.position), meta={"plan": wanted}).save(folder)
+    shutil.rmtree(parts, ignore_errors=True)
+    return made
+
+
+def spectra_at(dataset: Dataset, judge: str, holdout: str, reason: str, wanted: Tensor) -> Spectrum | None:
+    """The spectra at the positions `wanted` `[n, 3]`, in the dataset's order; None where there are none."""
+    name = PARTS[judge, holdout]
+    part = dataset.open_test(reason, name) if judge == "test" else dataset.validation
+    if part.spectra is None or not len(part.spectra):
+        return None
+    apart = torch.cdist(part.spectra.pose.position.double(), wanted.double()).amin(1)
+    return part.spectra[apart < 1e-3] if bool((apart < 1e-3).any()) else None
+
+
+class _First:
+    """The first `count` receivers of many."""
+
+    def __init__(self, paths: PathsReader, count: int) -> None:
+        if len(paths) < count:
+            raise InputError(f"{count} receivers were asked for and the paths have {len(paths)}; trace more")
+        self.paths, self.count = paths, count
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int, /) -> Paths:
+        return self.paths[index]
+
+
+def _spectra(paths: Path, folder: Path, count: int, progress: Progress) -> Spectrum:
+    grid = equirect_grid(*GRID)
+
+    def spectrum(number: int, one: Paths) -> Spectrum:
+        return spectrum_of(one, None, grid)
+
+    with PathsReader(paths) as reader:
+        first = _First(reader, count)
+        meta = {"generator": "benchmarks.quality.radiance", "seed": 0}
+        return stream_spectra(first, spectrum, folder, settings={"grid": list(GRID)}, meta=meta, progress=progress)
+
+
+def geometry_of(
+    kind: str, setting: Setting, folder: Path, *, count: int, progress: Progress | None = None
+) -> Gaussians:
+    """Gaussians of the scene: "photos" by the demo's visual stage on the shipped photographs, "mesh" on its surfaces.
+
+    Made once and kept in `folder`. Where things have moved the geometry shows them as they were before. Any other
+    `kind` is a .ply file.
+    """
+    if kind not in ("photos", "mesh"):
+        return read_ply(Path(kind))
+    path = folder / (f"{kind}.ply" if kind == "photos" else f"{kind}-{count}.ply")
+    if not path.exists():
+        made = _from_photographs(setting, progress) if kind == "photos" else _from_mesh(setting, count)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_ply(path, made)
+    return read_ply(path)
+
+
+def _from_photographs(setting: Setting, progress: Progress | None) -> Gaussians:
+    from rf3dgs.cli.demo import Demo
+    from rf3dgs.cli.facts import open_dataset
+    from rf3dgs.training.visual import fit_geometry
+
+    if setting.photographs != "lobby":
+        raise InputError(f"nobody photographed the scene {setting.name!r}; use --geometry mesh")
+    return fit_geometry(open_dataset("lobby").train.photos, Demo().visual, progress=progress)
+
+
+def _from_mesh(setting: Setting, count: int) -> Gaussians:
+    scene, around = Setting(BEFORE.get(setting.name, setting.name), setting.preset).scene(), setting.site.around
+    vertices, faces, colours = scene.mesh(None if around is None else around / 4)
+    if around is not None:
+        low, high = torch.tensor(scene.rx_bounds)[:, :2]
+        middle = vertices[faces].mean(1)[:, :2]
+        near = ((middle > low - around) & (middle < high + around)).all(-1)
+        faces, colours = faces[near], colours[near]
+    return sample_mesh(vertices, faces, count=count, colours=colours)
+
+
+def geometry_digest(gaussians: Gaussians) -> str:
+    """What identifies the Gaussians in a cell."""
+    return fingerprint(gaussians.tensors().values())
