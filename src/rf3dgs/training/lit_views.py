@@ -1,0 +1,111 @@
+"""What the mirror model's surface is fitted to: training spectra without their point sources, thrown back onto the
+Gaussians in linear power.
+
+For each view the rasterizer's own gradient gives every Gaussian the mean power of the pixels that it decides, their
+mean delay and departure weighted by power, and how many pixels those are.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rf3dgs.core.angles import angle_between
+from rf3dgs.core.errors import InputError
+from rf3dgs.core.grids import View, view_of
+from rf3dgs.field.lit import BLENDING
+from rf3dgs.field.radiance import NANOSECOND
+from rf3dgs.field.sources import PointSource
+from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.splats.rasterize import Backend, rasterize
+
+MASKED_SHARE = 0.3
+LEAST_WEIGHT = 0.02  # [pixel]; what a view tells of fainter Gaussians is left out
+LEAST_POWER = 1e-30
+
+
+@dataclass(frozen=True, eq=False)
+class LitView:
+    """One training spectrum without its point sources.
+
+    view: what it shows. keep `[row, col]`: solid angle of the pixel relative to the picture's mean, zero where point
+    sources bring more than 30 % of the power or there is none. channels `[row, col, 1 (+ 4)]`: the rest of the power,
+    linear, and that times delay [ns] and departure where the spectra have them.
+    """
+
+    view: View
+    keep: Tensor
+    channels: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """What views tell about Gaussians, one row for each pair: gaussian, view `[M]` long; weight `[M]` [pixel]; level_db
+    `[M]`: mean power; delay `[M]` [ns] and departure `[M, 3]`, means weighted by power, or None. receivers `[V, 3]`.
+    """
+
+    gaussian: Tensor
+    view: Tensor
+    weight: Tensor
+    level_db: Tensor
+    csi: Tensor | None
+    receivers: Tensor
+
+    def __len__(self) -> int:
+        return len(self.gaussian)
+
+
+def lit_views(spectra: Spectrum, sources: Sequence[tuple[PointSource, Tensor]]) -> list[LitView]:
+    """The views of `spectra` `[position, row, col]`; `sources`: point sources and where each is seen `[position]`."""
+    if spectra.grid.kind == "list":
+        raise InputError("the radio stage needs pinhole or equirectangular spectra; got a list of directions")
+    hidden = [[source for source, seen in sources if bool(seen[index])] for index in range(len(spectra))]
+    return [_view(spectra[index], hidden[index]) for index in range(len(spectra))]
+
+
+def _view(one: Spectrum, sources: Sequence[PointSource]) -> LitView:
+    area = one.grid.solid_angle / one.grid.solid_angle.mean()
+    here, power = one.pose.position, one.power.double()[..., None]
+    channels, points = power, torch.zeros_like(power[..., 0])
+    if one.delay is not None and one.aod is not None:
+        late = one.delay.double()[..., None] / NANOSECOND
+        channels = torch.cat((power, power * late, power * one.aod.double()), -1)
+    for source in sources:
+        beam = source.beam(one.directions, here, one.instrument)
+        share = (beam * source.gain(here, one.frequency)).double()[..., None]
+        parts = [share, share * source.delay(here) / NANOSECOND, share * source.departure(here)]
+        points = points + share[..., 0]
+        channels = channels - torch.cat(parts, -1)[..., : channels.shape[-1]]
+        angle = angle_between(one.directions, source.arrival(here).expand_as(one.directions))
+        points = torch.where(angle < one.instrument.lobe, power[..., 0], points)
+    keep = area * (points < MASKED_SHARE * power[..., 0]) * (channels[..., 0] > 0)
+    return LitView(view_of(one.pose, one.grid), keep, channels)
+
+
+def observe(geometry: Gaussians, views: Sequence[LitView], *, unit: float, backend: Backend = "auto") -> Observations:
+    """What `views` tell about every Gaussian of `geometry`; `unit`: the power that counts as 1 on the way."""
+    shape = tuple(tensor.detach() for tensor in (geometry.means, geometry.quats, geometry.scales, geometry.opacities))
+    has_csi = all(view.channels.shape[-1] == 5 for view in views)
+    columns = 6 if has_csi else 2
+    rows = []
+    for number, one in enumerate(views):
+        values = torch.zeros(len(geometry), columns, requires_grad=True)
+        with torch.enable_grad():
+            raster = rasterize(*shape, values, one.view, compositing=BLENDING, backend=backend)
+            target = (one.channels[..., : columns - 1] / unit).float()
+            target = torch.cat((torch.ones_like(target[..., :1]), target), -1) * one.keep[..., None]
+            (sums,) = torch.autograd.grad(raster.values, values, target)
+        chosen = ((sums[:, 0] > LEAST_WEIGHT) & (sums[:, 1] > 0)).nonzero().squeeze(-1)
+        rows.append((chosen, torch.full_like(chosen, number), sums[chosen]))
+    gaussian, view, sums = (torch.cat(part) for part in zip(*rows, strict=True))
+    power = sums[:, 1] / sums[:, 0] * unit
+    return Observations(
+        gaussian=gaussian,
+        view=view,
+        weight=sums[:, 0].contiguous(),
+        level_db=10 * torch.log10(power.clamp_min(LEAST_POWER)),
+        csi=sums[:, 2:] / sums[:, 1:2] if has_csi else None,
+        receivers=torch.stack([one.view.position for one in views]),
+    )
