@@ -9,8 +9,9 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid
 from rf3dgs.core.units import friis_gain
-from rf3dgs.field.sources import Blockers, PointSource, estimate_transmitter, fit_line_of_sight, fit_opening
+from rf3dgs.field.sources import PointSource, estimate_transmitter, fit_line_of_sight, fit_opening
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
+from rf3dgs.splats.obstacles import Obstacles
 
 
 def cluttered(count: int, *, blocked: int, seed: int, degrees: float = 2.0, lobe: float = 3.0) -> tuple[Spectrum, Pose]:
@@ -78,11 +79,11 @@ def test_a_source_that_nobody_sees_keeps_its_level():
 
 
 def test_a_wall_hides_a_source_and_the_threshold_follows_what_was_seen(wall):
-    blockers = Blockers(wall.means, wall.quats, wall.scales, wall.opacities)
+    obstacles = Obstacles(wall.means, wall.quats, wall.scales, wall.opacities)
     source = PointSource(torch.tensor([1.0, 1.0, 2.0]), torch.tensor([1.0, 1.0, 2.0]))
     receivers = torch.tensor([[2.0, 3.0, 1.0], [5.0, 3.0, 1.0], [4.0, 1.0, 1.5]])
-    assert source.visible(receivers, blockers).tolist() == [True, False, False]
-    haze = replace(blockers, opacities=torch.full_like(blockers.opacities, 0.35))
+    assert source.visible(receivers, obstacles).tolist() == [True, False, False]
+    haze = replace(obstacles, opacities=torch.full_like(obstacles.opacities, 0.35))
     passed = source.transmittance(receivers, haze)
     assert 0.01 < float(passed[1]) < 0.9
     fitted = fit_opening(source, torch.tensor([True, True, True]), receivers, haze)

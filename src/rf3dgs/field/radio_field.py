@@ -6,6 +6,7 @@ A field is a sum of parts in linear power: what the surface sends (`field.radian
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -18,10 +19,11 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid, sample_grid, view_of
 from rf3dgs.field.lit import LitSurface
 from rf3dgs.field.radiance import Radiance, Surface
-from rf3dgs.field.sources import Blockers, PointSource
+from rf3dgs.field.sources import PointSource
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
+from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.splats.rasterize import Backend
 
 
@@ -53,10 +55,10 @@ class RadioField:
         """The dB window in which pictures of this field are drawn; the paper's surface was trained in it, too."""
         return self.surface.window
 
-    @property
-    def blockers(self) -> Blockers:
+    @cached_property
+    def obstacles(self) -> Obstacles:
         """The Gaussians as obstacles."""
-        return Blockers(self.surface.means, self.surface.quats, self.surface.scales, self.solidity)
+        return Obstacles(self.surface.means, self.surface.quats, self.surface.scales, self.solidity)
 
     def covers(self, pose: Pose, *, margin: float = 0.5) -> Tensor:
         """True `[*batch]` for receivers in the box of the training positions, widened by `margin` [m]."""
@@ -67,7 +69,7 @@ class RadioField:
         """True `[*batch]` where the line of sight is a part of this field and open."""
         if not self.sources:
             return torch.zeros(pose.batch_shape, dtype=torch.bool)
-        return self.sources[0].visible(pose.position, self.blockers)
+        return self.sources[0].visible(pose.position, self.obstacles)
 
     def render(self, pose: Pose, grid: DirectionGrid, *, csi: bool = True) -> Spectrum:
         """The spectrum at one pose or a batch `[*batch]`: linear power, and delay [s] and departure per direction.
@@ -145,7 +147,7 @@ class RadioField:
         weighted_delay = None if delay is None else surface.power * delay
         weighted_aod = None if aod is None else surface.power[..., None] * aod
         for source in self.sources:
-            if not bool(source.visible(pose.position, self.blockers)):
+            if not bool(source.visible(pose.position, self.obstacles)):
                 continue
             beam = source.beam(directions, pose.position, self.instrument)
             share = beam * source.gain(pose.position, self.frequency)
@@ -172,7 +174,7 @@ class RadioField:
         """Rows `[strongest, 9]`: gain, delay, arrival (3), departure (3), order; a row of zero gain is padding."""
         rows = []
         for order, source in enumerate(self.sources):
-            if bool(source.visible(pose.position, self.blockers)):
+            if bool(source.visible(pose.position, self.obstacles)):
                 at = pose.position
                 head = torch.stack((source.gain(at, self.frequency), source.delay(at)))
                 rows.append(

@@ -15,17 +15,7 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.spectra.peaks import main_peak
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
-from rf3dgs.splats.transmittance import segment_transmittance
-
-
-@dataclass(frozen=True, eq=False)
-class Blockers:
-    """The Gaussians that stop a ray: means `[N, 3]`, quats `[N, 4]`, scales `[N, 3]` [m] and opacities `[N]`."""
-
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
+from rf3dgs.splats.obstacles import Obstacles
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,16 +51,15 @@ class PointSource:
         """Path gain `[*batch]`, linear, where nothing is in the way: Friis times `gain_db`."""
         return friis_gain(self.distance(receiver), frequency) * 10.0 ** (self.gain_db / 10.0)
 
-    def visible(self, receiver: Tensor, blockers: Blockers) -> Tensor:
+    def visible(self, receiver: Tensor, obstacles: Obstacles) -> Tensor:
         """True `[*batch]` where the segment from the source to the receiver is open."""
-        return self.transmittance(receiver, blockers) > self.open_above
+        return self.transmittance(receiver, obstacles) > self.open_above
 
-    def transmittance(self, receiver: Tensor, blockers: Blockers) -> Tensor:
+    def transmittance(self, receiver: Tensor, obstacles: Obstacles) -> Tensor:
         """Share `[*batch]` that the Gaussians let through between source and receivers, without end pieces of 10 cm."""
         flat = receiver.reshape(-1, 3)
         start = self.position.expand_as(flat)
-        passed = segment_transmittance(blockers.means, blockers.quats, blockers.scales, blockers.opacities, start, flat)
-        return passed.reshape(receiver.shape[:-1])
+        return obstacles.transmittance(start, flat).reshape(receiver.shape[:-1])
 
     def beam(self, directions: Tensor, receiver: Tensor, instrument: Instrument) -> Tensor:
         """Relative power `[*shape]` seen by an instrument at `receiver` `[3]` along world directions `[*shape, 3]`."""
@@ -112,9 +101,9 @@ def fit_line_of_sight(source: PointSource, spectra: Spectrum) -> tuple[PointSour
     return replace(source, gain_db=float(level_db[seen].median())), seen
 
 
-def fit_opening(source: PointSource, seen: Tensor, positions: Tensor, blockers: Blockers) -> PointSource:
+def fit_opening(source: PointSource, seen: Tensor, positions: Tensor, obstacles: Obstacles) -> PointSource:
     """The source with the transmittance threshold that agrees best with where training spectra see it `[position]`."""
-    passed = source.transmittance(positions, blockers)
+    passed = source.transmittance(positions, obstacles)
     thresholds = torch.tensor([0.1, 0.05, 0.2, 0.02, 0.3, 0.01, 0.5])
     agreement = ((passed[None] > thresholds[:, None]) == seen[None]).sum(-1)
     return replace(source, open_above=float(thresholds[agreement.argmax()]))

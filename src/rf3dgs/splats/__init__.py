@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from rf3dgs.splats.image_loss import l1_ssim as l1_ssim
     from rf3dgs.splats.image_loss import psnr as psnr
     from rf3dgs.splats.image_loss import ssim as ssim
+    from rf3dgs.splats.obstacles import Obstacles as Obstacles
+    from rf3dgs.splats.obstacles import visibility_of as visibility_of
     from rf3dgs.splats.ply import read_ply as read_ply
     from rf3dgs.splats.ply import read_point_cloud as read_point_cloud
     from rf3dgs.splats.ply import write_ply as write_ply
@@ -44,6 +46,8 @@ __all__ = [  # noqa: RUF022
     "level_of_detail",
     "prune_unseen",
     "sample_mesh",
+    "Obstacles",
+    "visibility_of",
     "segment_transmittance",
     "read_ply",
     "write_ply",
@@ -67,6 +71,8 @@ __getattr__, __dir__ = lazy_names(
         "level_of_detail": ".detail",
         "prune_unseen": ".detail",
         "sample_mesh": ".surface",
+        "Obstacles": ".obstacles",
+        "visibility_of": ".obstacles",
         "segment_transmittance": ".transmittance",
         "read_ply": ".ply",
         "write_ply": ".ply",

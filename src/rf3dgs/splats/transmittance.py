@@ -1,6 +1,7 @@
-"""How much passes along a straight segment through the Gaussians, for visibility between points.
+"""How much passes along a straight segment through the Gaussians, for visibility between points: the specification.
 
 This is not the alpha of a picture: each Gaussian counts once, with its peak along the segment in closed form.
+`splats.obstacles` answers the same question in the native core.
 """
 
 import torch
@@ -22,14 +23,19 @@ def segment_transmittance(
     start: Tensor,
     end: Tensor,
     *,
+    labels: Tensor | None = None,
+    skip_start: Tensor | None = None,
+    skip_end: Tensor | None = None,
     stop_short: float = 0.10,
     min_opacity: float = 0.3,
 ) -> Tensor:
     """Transmittance `[segment]` in 0..1 from `start` to `end` `[segment, 3]` [m]: the product of 1 - o exp(-d^2 / 2).
 
     o is a Gaussian's opacity and d the least Mahalanobis distance to the segment, from which `stop_short` [m] is cut
-    off at both ends so that the surfaces it joins do not hide each other; a segment of no length left is free.
-    Gaussians fainter than `min_opacity`, or not finite, are ignored. The result carries no gradient.
+    off at both ends so that the surfaces it joins do not hide each other; a segment of no length left is free, one
+    that is not finite passes nothing. Gaussians fainter than `min_opacity`, or not finite, are ignored, and so are
+    those of `labels` `[gaussian]` that equal the segment's `skip_start` or `skip_end` `[segment]`, where these are
+    not negative. The result carries no gradient.
     """
     start, end = torch.broadcast_tensors(torch.atleast_2d(start), torch.atleast_2d(end))
     if start.shape[-1] != 3 or start.dim() != 2:
@@ -37,9 +43,13 @@ def segment_transmittance(
     start, end = start.to(means.dtype), end.to(means.dtype)
     span = end - start
     length = torch.linalg.vector_norm(span, dim=-1)
+    finite = torch.isfinite(length) & torch.isfinite(start).all(-1)
+    start, span = torch.where(finite[:, None], start, 0.0), torch.where(finite[:, None], span, 0.0)
+    length = torch.where(finite, length, 0.0)
     along = span / length.clamp_min(1e-9)[:, None]
-    reach = scales.amax(-1) * CUT
-    reach = torch.where(opacities >= min_opacity, reach, -1.0)
+    sound = torch.isfinite(torch.cat((means, quats, scales), -1)).all(-1) & (quats.square().sum(-1) > 1e-24)
+    reach = torch.where(sound & (opacities >= min_opacity), scales.amax(-1) * CUT, -1.0)
+    means = torch.where(sound[:, None], means, 0.0)
     result = torch.ones_like(length)
     for index in torch.arange(len(start)).split(max(1, _PAIRS_PER_CHUNK // max(1, len(means)))):
         first, direction = start[index], along[index]
@@ -54,9 +64,14 @@ def segment_transmittance(
         distance2 = (offset + nearest[:, None] * step).square().sum(-1)
         blocked = opacities[gaussian].clamp_max(1.0) * torch.exp(-0.5 * distance2)
         blocked = torch.where(high > low, blocked, 0.0).nan_to_num(0.0)
+        if labels is not None:
+            for skip in (skip_start, skip_end):
+                if skip is not None:
+                    of_segment = skip[index][segment]
+                    blocked = torch.where((labels[gaussian] == of_segment) & (of_segment >= 0), 0.0, blocked)
         passed = torch.zeros_like(result[index]).index_add_(0, segment, torch.log1p(-blocked))
         result[index] = torch.exp(passed)
-    return result
+    return torch.where(finite, result, 0.0)
 
 
 def _near_pairs(means: Tensor, reach: Tensor, start: Tensor, along: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:

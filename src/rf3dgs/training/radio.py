@@ -16,12 +16,13 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.field.radiance import Surface
 from rf3dgs.field.radio_field import RadioField
-from rf3dgs.field.sources import Blockers, PointSource, estimate_transmitter, fit_line_of_sight, fit_opening
+from rf3dgs.field.sources import PointSource, estimate_transmitter, fit_line_of_sight, fit_opening
 from rf3dgs.spectra.codec import DbWindow, PaperEncoding, window_of
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.detail import level_of_detail
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import C0
+from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.checkpoint import fingerprint
 from rf3dgs.training.config import RadioConfig
 from rf3dgs.training.loop import train
@@ -58,11 +59,11 @@ def fit_radio(
     estimated = where is None
     where = estimate_transmitter(spectra) if where is None else where
     window = _window(spectra, config)
-    blockers = Blockers(geometry.means, geometry.quats, geometry.scales, geometry.opacities)
+    obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, geometry.opacities)
     sources, seen = (), torch.zeros(len(spectra), dtype=torch.bool)
     if config.line_of_sight == "source":
         source, seen = fit_line_of_sight(PointSource(where.position, where.position), spectra)
-        sources = (fit_opening(source, seen, spectra.pose.position, blockers),)
+        sources = (fit_opening(source, seen, spectra.pose.position, obstacles),)
     span = PaperEncoding.of(spectra).delay_span if config.encoding == "paper" and spectra.delay is not None else 1e-7
     bare = Surface.bare(
         geometry,

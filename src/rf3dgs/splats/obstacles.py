@@ -1,0 +1,136 @@
+"""The Gaussians as obstacles: how much of a straight segment's power they let through, for any number of segments.
+
+What passes is defined in `splats.transmittance`.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from rf3dgs.core.errors import InputError
+from rf3dgs.splats.transmittance import segment_transmittance
+
+SOFT_RADIUS = 0.05  # m
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacles:
+    """The Gaussians that stop a ray: means `[N, 3]`, quats `[N, 4]`, scales `[N, 3]` [m] and opacities `[N]` in 0..1.
+
+    labels `[N]` name what a Gaussian belongs to, such as its plane; -1 is nothing. Gaussians fainter than
+    `min_opacity`, or not finite, stop nothing. The tensors must not be changed afterwards.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    labels: Tensor | None = None
+    min_opacity: float = field(default=0.3, kw_only=True)
+
+    def __post_init__(self) -> None:
+        count = len(self.means) if self.means.dim() else 0
+        shapes = {"means": (count, 3), "quats": (count, 4), "scales": (count, 3), "opacities": (count,)}
+        if self.labels is not None:
+            shapes["labels"] = (count,)
+        for name, shape in shapes.items():
+            got = tuple(getattr(self, name).shape)
+            if got != shape:
+                text = ", ".join(("gaussian", *(str(size) for size in shape[1:])))
+                raise InputError(f"{name} must be [{text}] for {count} Gaussians; got {list(got)}. Reshape it")
+
+    def transmittance(
+        self,
+        start: Tensor,
+        end: Tensor,
+        *,
+        skip_start: Tensor | None = None,
+        skip_end: Tensor | None = None,
+        stop_short: float = 0.10,
+    ) -> Tensor:
+        """Share `[segment]` in 0..1 that passes from `start` to `end` `[segment, 3]` [m], without gradient.
+
+        Gaussians labelled `skip_start` or `skip_end` `[segment]` do not stop that segment; -1 skips nothing.
+        `stop_short` [m] is cut off at both ends. A segment of no length left is free, one that is not finite passes
+        nothing.
+        """
+        start, end = _segments(start, end)
+        skips = [self._skip(skip, len(start), name) for skip, name in ((skip_start, "start"), (skip_end, "end"))]
+        return segment_transmittance(
+            *(self.means, self.quats, self.scales, self.opacities, start, end),
+            labels=self.labels,
+            skip_start=skips[0],
+            skip_end=skips[1],
+            stop_short=stop_short,
+            min_opacity=self.min_opacity,
+        )
+
+    def soft(
+        self,
+        start: Tensor,
+        end: Tensor,
+        *,
+        radius: float = SOFT_RADIUS,
+        skip_start: Tensor | None = None,
+        skip_end: Tensor | None = None,
+        stop_short: float = 0.10,
+    ) -> Tensor:
+        """Mean transmittance `[segment]` of the segment and six parallel ones at `radius` [m] around it."""
+        start, end = _segments(start, end)
+        total = self.transmittance(start, end, skip_start=skip_start, skip_end=skip_end, stop_short=stop_short)
+        across, up = _across(end - start)
+        for ray in range(6):
+            angle = ray * math.pi / 3
+            shift = radius * (math.cos(angle) * across + math.sin(angle) * up)
+            total = total + self.transmittance(
+                start + shift, end + shift, skip_start=skip_start, skip_end=skip_end, stop_short=stop_short
+            )
+        return total / 7
+
+    def _skip(self, skip: Tensor | None, count: int, end: str) -> Tensor | None:
+        if skip is None:
+            return None
+        if self.labels is None:
+            raise InputError(f"skip_{end} needs obstacles with labels; these have none. Give labels when they are made")
+        if skip.shape != (count,):
+            raise InputError(f"skip_{end} must be [segment] for {count} segments; got {list(skip.shape)}")
+        return skip.to(torch.long)
+
+
+def visibility_of(
+    obstacles: Obstacles,
+    means: Tensor,
+    normals: Tensor,
+    tx: Tensor,
+    labels: Tensor | None = None,
+    *,
+    lift: float = 0.05,
+) -> Tensor:
+    """Share `[point]` of the power that reaches surface points `means` `[point, 3]` [m] from `tx` `[3]`.
+
+    A segment starts `lift` [m] off the surface along its normal (`normals` `[point, 3]`, unit, on the side that is
+    lit); obstacles with the point's own one of `labels` `[point]` do not hide it.
+    """
+    if means.shape != normals.shape:
+        raise InputError(f"normals must be {list(means.shape)} as the means; got {list(normals.shape)}")
+    return obstacles.transmittance(means + lift * normals, tx.reshape(1, 3).expand_as(means), skip_start=labels)
+
+
+def _segments(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+    start, end = torch.atleast_2d(start), torch.atleast_2d(end)
+    if start.dim() != 2 or end.dim() != 2 or start.shape[1] != 3 or end.shape[1] != 3:
+        raise InputError(f"start and end must be [segment, 3] in metres; got {list(start.shape)}, {list(end.shape)}")
+    if len(start) != len(end) and 1 not in (len(start), len(end)):
+        raise InputError(f"start and end must be as many, or one of them one; got {len(start)} and {len(end)}")
+    start, end = torch.broadcast_tensors(start, end)
+    return start, end
+
+
+def _across(span: Tensor) -> tuple[Tensor, Tensor]:
+    """Two unit vectors `[segment, 3]` across each span and each other."""
+    along = torch.nn.functional.normalize(span, dim=-1)
+    least = torch.nn.functional.one_hot(along.abs().argmin(-1), 3).to(along.dtype)
+    across = torch.nn.functional.normalize(torch.linalg.cross(along, least, dim=-1), dim=-1)
+    return across, torch.linalg.cross(along, across, dim=-1)
