@@ -8,12 +8,12 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose, matrix_from_quaternion
 from rf3dgs.core.grids import Camera, pinhole_grid
 from rf3dgs.data.photo import Photo
+from rf3dgs.geometry.planes import directions_of, find_planes
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.image_loss import psnr
 from rf3dgs.training.config import VisualConfig
 from rf3dgs.training.initial import camera_box, random_start, upright, views_of
 from rf3dgs.training.photographs import blending_weights, clamp_needles, depth_error, render_photo
-from rf3dgs.training.planes import directions_of, find_planes
 from rf3dgs.training.schedule import Schedule
 from rf3dgs.training.sweep import Surfaces, swept_surfaces
 from rf3dgs.training.visual import VisualStage, fit_geometry

@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid, sample_grid, view_of
 from rf3dgs.field.lit import LitSurface
 from rf3dgs.field.radiance import Radiance, Surface
-from rf3dgs.field.sources import PointSource
+from rf3dgs.field.sources import PointSources, Rays
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
@@ -32,15 +33,16 @@ class RadioField:
     """A radio radiance field of one transmitter at one frequency.
 
     surface: the Gaussians that scatter, by the mirror model's laws (`LitSurface`) or the paper's harmonics (`Surface`).
-    solidity `[N]`: their opacity to rays as the geometry has it, 0..1, which
-    decides what hides a point source. sources: the point sources, the line of sight first; may be empty.
+    solidity `[N]`: their opacity to rays as the geometry has it, 0..1, which decides what hides a point source.
+    sources: the point sources, the line of sight first, or None.
+    plane_of `[N]`: the plane of the sources that a Gaussian belongs to, -1 for none; None when there are no planes.
     frequency [Hz]; instrument: what its training spectra were taken with, and so what it renders.
     tx: the transmitter's pose, given or estimated. bounds `[2, 3]`: low and high corner of the training positions [m].
     colour `[N, 3]` uint8: how a viewer paints the Gaussians. meta: free text about the run (seed, versions, steps).
     """
 
     surface: Surface | LitSurface
-    sources: tuple[PointSource, ...]
+    sources: PointSources | None
     solidity: Tensor
     frequency: float
     instrument: Instrument
@@ -49,6 +51,7 @@ class RadioField:
     colour: Tensor
     meta: dict[str, str | int | float | bool] = field(default_factory=dict)
     backend: Backend = "auto"
+    plane_of: Tensor | None = None
 
     @property
     def window(self) -> DbWindow:
@@ -57,8 +60,9 @@ class RadioField:
 
     @cached_property
     def obstacles(self) -> Obstacles:
-        """The Gaussians as obstacles."""
-        return Obstacles(self.surface.means, self.surface.quats, self.surface.scales, self.solidity)
+        """The Gaussians as obstacles, labelled by the plane they belong to."""
+        surface = self.surface
+        return Obstacles(surface.means, surface.quats, surface.scales, self.solidity, self.plane_of)
 
     def covers(self, pose: Pose, *, margin: float = 0.5) -> Tensor:
         """True `[*batch]` for receivers in the box of the training positions, widened by `margin` [m]."""
@@ -67,9 +71,9 @@ class RadioField:
 
     def sees_transmitter(self, pose: Pose) -> Tensor:
         """True `[*batch]` where the line of sight is a part of this field and open."""
-        if not self.sources:
+        if self.sources is None:
             return torch.zeros(pose.batch_shape, dtype=torch.bool)
-        return self.sources[0].visible(pose.position, self.obstacles)
+        return self.sources.sees(pose.position, self.obstacles)
 
     def render(self, pose: Pose, grid: DirectionGrid, *, csi: bool = True) -> Spectrum:
         """The spectrum at one pose or a batch `[*batch]`: linear power, and delay [s] and departure per direction.
@@ -90,21 +94,26 @@ class RadioField:
             aod = torch.stack([part.aod for part in parts if part.aod is not None]).reshape(*power.shape, 3)
         return Spectrum(power, grid, pose, self.frequency, self.instrument, "field", delay, aod, self.tx)
 
-    def paths(self, pose: Pose, *, strongest: int = 8) -> Paths:
+    def paths(self, pose: Pose, *, strongest: int = 8, parts: Literal["all", "sources"] = "all") -> Paths:
         """The strongest paths `[*batch, strongest]` at one pose or a batch, strongest first.
 
-        A point source in sight gives its exact arrival, departure, delay D / c and gain. Every other path is a peak
-        of the surface's spectrum: its gain is the power in the beam there, its delay and departure are those of the
-        pixel. `coeff` is real and positive: the carrier's phase is the caller's choice in `cfr` and `cir`. `order` is
-        0 for the line of sight and 1 for peaks of the surface, whose number of bounces a field does not know.
+        A point source that reaches the receiver gives its exact arrival, departure and delay D / c, and its gain; these
+        come first. Places that are left are filled with peaks of the surface's spectrum: the gain of such a path is the
+        power in the beam there, its delay and departure are those of the pixel. `parts="sources"` leaves the peaks out,
+        which takes less than a millisecond a pose. `coeff` is real and positive: the carrier's phase is the caller's
+        choice in `cfr` and `cir`. `order` is the number of reflections of a point source and 1 for a peak of the
+        surface, whose number of bounces a field does not know; `kind` tells them apart: 0 the line of sight, 1
+        mirrors, 2 the surface.
         """
         if strongest < 1:
             raise InputError(f"strongest must be at least 1; got {strongest}")
+        if parts not in ("all", "sources"):
+            raise InputError(f'parts must be "all" or "sources"; got {parts!r}')
         flat = pose.flat()
         if len(flat) == 0:
             raise InputError("paths needs at least one pose; got an empty batch")
-        rows = [self._paths_of_one(flat[index], strongest) for index in range(len(flat))]
-        table = torch.stack(rows).reshape(*pose.batch_shape, strongest, 9)
+        rows = [self._paths_of_one(flat[index], strongest, parts == "all") for index in range(len(flat))]
+        table = torch.stack(rows).reshape(*pose.batch_shape, strongest, 10)
         aoa_zenith, aoa_azimuth = angles_of(table[..., 2:5])
         aod_zenith, aod_azimuth = angles_of(table[..., 5:8])
         return Paths(
@@ -118,12 +127,13 @@ class RadioField:
             frequency=self.frequency,
             tx=self.tx,
             rx=pose,
-            order=table[..., 8].round().long(),
+            order=table[..., 8].long(),
+            kind=table[..., 9].long(),
         )
 
     def without_sources(self) -> "RadioField":
         """The surface alone."""
-        return replace(self, sources=())
+        return replace(self, sources=None)
 
     def save(self, path: str | Path) -> None:
         """Write the folder `path` (NAME.field); see `field.io.save_field`."""
@@ -140,27 +150,9 @@ class RadioField:
 
     def _render_one(self, pose: Pose, grid: DirectionGrid, csi: bool) -> Radiance:
         surface = self.surface.radiance(self._channels(pose, grid, csi), pose.position)
-        if not self.sources:
+        if self.sources is None:
             return surface
-        directions = pose.to_world(grid.directions)
-        power, delay, aod = surface.power, surface.delay, surface.aod
-        weighted_delay = None if delay is None else surface.power * delay
-        weighted_aod = None if aod is None else surface.power[..., None] * aod
-        for source in self.sources:
-            if not bool(source.visible(pose.position, self.obstacles)):
-                continue
-            beam = source.beam(directions, pose.position, self.instrument)
-            share = beam * source.gain(pose.position, self.frequency)
-            power = power + share
-            if weighted_delay is not None and weighted_aod is not None:
-                weighted_delay = weighted_delay + share * source.delay(pose.position)
-                weighted_aod = weighted_aod + share[..., None] * source.departure(pose.position)
-        if weighted_delay is None or weighted_aod is None:
-            return Radiance(power)
-        reached = power > 0
-        delay = torch.where(reached, weighted_delay / torch.where(reached, power, 1.0), torch.zeros_like(power))
-        scale = torch.where(reached, power, 1.0)[..., None]
-        return Radiance(power, delay, torch.nn.functional.normalize(weighted_aod / scale, dim=-1, eps=1e-9))
+        return with_rays(surface, self.sources.rays(pose.position, self.obstacles), pose, grid, self.instrument)
 
     def _channels(self, pose: Pose, grid: DirectionGrid, csi: bool) -> Tensor:
         if grid.kind != "list":
@@ -170,31 +162,53 @@ class RadioField:
         picture = self.surface.picture(view_of(pose, sphere), csi=csi, backend=self.backend)
         return sample_grid(picture, sphere, grid.directions)
 
-    def _paths_of_one(self, pose: Pose, strongest: int) -> Tensor:
-        """Rows `[strongest, 9]`: gain, delay, arrival (3), departure (3), order; a row of zero gain is padding."""
-        rows = []
-        for order, source in enumerate(self.sources):
-            if bool(source.visible(pose.position, self.obstacles)):
-                at = pose.position
-                head = torch.stack((source.gain(at, self.frequency), source.delay(at)))
-                rows.append(
-                    torch.cat((head, source.arrival(at), source.departure(at), torch.tensor([min(order, 1.0)])))
-                )
+    def _paths_of_one(self, pose: Pose, strongest: int, with_peaks: bool) -> Tensor:
+        """Rows `[strongest, 10]`: gain, delay, arrival (3), departure (3), order, kind; zero gain is padding."""
+        table = torch.zeros(0, 10)
+        if self.sources is not None:
+            rays = self.sources.rays(pose.position, self.obstacles)
+            numbers = torch.stack((rays.order, rays.order.clamp_max(1)), -1).to(rays.power.dtype)
+            head = torch.stack((rays.power, rays.delay), -1)
+            table = torch.cat((head, rays.arrival, rays.departure, numbers), -1)
+            table = table[table[:, 0].argsort(descending=True, stable=True)][:strongest]
+        if with_peaks and len(table) < strongest:
+            table = torch.cat((table, self._peaks(pose, strongest - len(table))))
+            table = table[table[:, 0].argsort(descending=True, stable=True)]
+        return torch.cat((table, torch.zeros(strongest - len(table), 10)))
+
+    def _peaks(self, pose: Pose, count: int) -> Tensor:
+        """At most `count` rows `[n, 10]` as above, of peaks of the surface's spectrum."""
         lobe = self.instrument.lobe
         width = min(360, max(72, 4 * math.ceil(0.5 * math.pi / (lobe / 1.5))))
         grid = equirect_grid(width, width // 2)
         surface = self.without_sources()._render_one(pose, grid, True)
         assert surface.delay is not None
         assert surface.aod is not None
-        directions, gains = find_peaks(surface.power, grid, count=strongest, separation=lobe)
+        directions, gains = find_peaks(surface.power, grid, count=count, separation=lobe)
         x, y = grid.pixel_of(directions)[0].unbind(-1)
         row, col = y.long().clamp(0, grid.height - 1), x.long().clamp(0, grid.width - 1)
-        found = (
-            torch.stack((gains, surface.delay[row, col]), -1),
-            pose.to_world(directions),
-            surface.aod[row, col],
-            torch.ones(len(gains), 1),
-        )
-        table = torch.cat((*[row[None] for row in rows], torch.cat(found, -1)))
-        table = table[table[:, 0].argsort(descending=True, stable=True)][:strongest]
-        return torch.cat((table, torch.zeros(strongest - len(table), 9)))
+        head = torch.stack((gains, surface.delay[row, col]), -1)
+        numbers = torch.tensor([1.0, 2.0]).expand(len(gains), 2)
+        return torch.cat((head, pose.to_world(directions), surface.aod[row, col], numbers), -1)
+
+
+def with_rays(surface: Radiance, rays: Rays, pose: Pose, grid: DirectionGrid, instrument: Instrument) -> Radiance:
+    """The radiance of a surface and what arrives at `pose` from point sources, summed in linear power.
+
+    Delay and departure, where the surface has them, are means weighted by power.
+    """
+    place, ray, share = rays.shares(pose.to_world(grid.directions), instrument)
+
+    def added(to: Tensor, what: Tensor) -> Tensor:
+        flat = to.reshape(grid.solid_angle.numel(), *what.shape[1:])
+        return flat.index_add(0, place, what).reshape(to.shape)
+
+    power = added(surface.power, share)
+    if surface.delay is None or surface.aod is None:
+        return Radiance(power)
+    delay = added(surface.power * surface.delay, share * rays.delay[ray])
+    aod = added(surface.power[..., None] * surface.aod, share[:, None] * rays.departure[ray])
+    reached = power > 0
+    scale = torch.where(reached, power, 1.0)
+    delay = torch.where(reached, delay / scale, torch.zeros_like(power))
+    return Radiance(power, delay, torch.nn.functional.normalize(aod / scale[..., None], dim=-1, eps=1e-9))

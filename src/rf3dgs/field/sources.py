@@ -1,176 +1,203 @@
-"""Point sources: what reaches a receiver straight from one point, the transmitter first of all.
+"""Point sources: what reaches a receiver from single points, the transmitter and its mirror images.
 
-A point source is a delta that moves with the receiver, which no harmonics on surfaces can follow; its power, delay,
-arrival and departure are known in closed form. The transmitter's mirror images are point sources of the same kind.
+A point source is a delta that moves with the receiver, which no harmonics on surfaces can follow; its arrival,
+departure and delay are exact, its power has a few learned numbers (docs/theory/radiance.md). Which sources reach a
+receiver is decided by geometry: every reflection falls on surface, and every leg of the way is open.
 """
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
-from rf3dgs.core.frames import Pose
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
-from rf3dgs.spectra.peaks import main_peak
-from rf3dgs.spectra.spectrum import Instrument, Spectrum
+from rf3dgs.field.images import HIGHEST_ORDER, Folded, fold, image_chain
+from rf3dgs.geometry import Patches, Planes
+from rf3dgs.spectra.spectrum import Instrument
 from rf3dgs.splats.obstacles import Obstacles
+
+FARTHEST_LOBES = 6.2  # where a lobe's kernel is zero in float32
 
 
 @dataclass(frozen=True, eq=False)
-class PointSource:
-    """A source at `position` `[3]` [m]; its waves leave the transmitter at `tx` `[3]`, the same for the line of sight.
+class Rays:
+    """What arrives at one receiver from k point sources, in the order of the sources.
 
-    gain_db: level over Friis' free-space gain between isotropic antennas. open_above: the transmittance of the
-    segment to the receiver above which the source is seen.
+    index `[k]`: rows of `PointSources.sequence`. power `[k]`: path gains, linear. arrival, departure `[k, 3]`: unit
+    vectors from the receiver and from the transmitter. delay `[k]` [s]. order `[k]`: number of reflections. points
+    `[k, 3, 3]`: where they happen [m], the receiver beyond the last.
     """
 
-    position: Tensor
+    index: Tensor
+    power: Tensor
+    arrival: Tensor
+    departure: Tensor
+    delay: Tensor
+    order: Tensor
+    points: Tensor
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def only(self, chosen: Tensor) -> "Rays":
+        """Some of the rays: `chosen` is a mask `[k]` or a list of places."""
+        names = ("index", "power", "arrival", "departure", "delay", "order", "points")
+        return Rays(*(getattr(self, name)[chosen] for name in names))
+
+    def shares(self, directions: Tensor, instrument: Instrument) -> tuple[Tensor, Tensor, Tensor]:
+        """What an instrument sees of each ray: place in the flattened picture `[n]`, ray `[n]` and power `[n]`.
+
+        directions `[*shape, 3]`: unit vectors of the pixels in the world; pairs of no power are left out.
+        """
+        flat = directions.reshape(-1, 3)
+        reach = math.cos(min(math.pi, FARTHEST_LOBES * instrument.lobe))
+        place, ray = torch.nonzero(flat @ self.arrival.mT >= reach - 1e-6, as_tuple=True)
+        kernel = instrument.kernel(angle_between(flat[place], self.arrival[ray]))
+        return place, ray, kernel * self.power[ray]
+
+    def picture(self, directions: Tensor, instrument: Instrument) -> Tensor:
+        """Power `[*shape]`, linear, that the instrument sees along world directions `[*shape, 3]`."""
+        place, _, share = self.shares(directions, instrument)
+        picture = share.new_zeros(directions[..., 0].numel()).index_add_(0, place, share)
+        return picture.reshape(directions.shape[:-1])
+
+
+@dataclass(frozen=True, eq=False)
+class PointSources:
+    """The transmitter and its images in planes, all point sources of a field.
+
+    tx `[3]`: the transmitter [m]. frequency [Hz]. level_db: power over Friis' free-space gain of isotropic antennas,
+    of the line of sight and of all images. planes: P planes; patches: where they have surface, or None for everywhere.
+    reflection `[P, 3]`: a, b and c of 10 log10 Gamma = a + b cos + c cos^2 at the angle of incidence, at most 0 dB.
+    sequence `[K, 3]`: the planes of each source in the order from the transmitter, -1 beyond the last; the first row is
+    the line of sight, all -1. open_above: the transmittance of a way above which it is open.
+    """
+
     tx: Tensor
-    gain_db: float = 0.0
+    frequency: float
+    planes: Planes
+    patches: Patches | None
+    sequence: Tensor
+    reflection: Tensor
+    level_db: float = 0.0
     open_above: float = 0.1
 
-    def distance(self, receiver: Tensor) -> Tensor:
-        """Length of the path `[*batch]` [m] to receivers `[*batch, 3]`."""
-        return torch.linalg.vector_norm(receiver - self.position, dim=-1).clamp_min(1e-3)
+    def __post_init__(self) -> None:
+        count = len(self.planes)
+        if self.tx.shape != (3,):
+            raise InputError(f"tx must be three coordinates in metres; got {list(self.tx.shape)}")
+        if self.reflection.shape != (count, 3):
+            raise InputError(f"reflection must be [{count}, 3], a row a plane; got {list(self.reflection.shape)}")
+        rows = self.sequence
+        if rows.dim() != 2 or rows.shape[1:] != (HIGHEST_ORDER,) or not len(rows) or bool((rows[0] >= 0).any()):
+            raise InputError(
+                f"sequence must be [source, {HIGHEST_ORDER}] with the line of sight, all -1, first; "
+                f"got {list(rows.shape)}"
+            )
+        if bool(((rows < -1) | (rows >= count)).any()) or bool(((rows[:, 1:] >= 0) & (rows[:, :-1] < 0)).any()):
+            raise InputError(f"sequence must name planes below {count} without gaps; -1 stands beyond the last")
 
-    def delay(self, receiver: Tensor) -> Tensor:
-        """Delay D / c `[*batch]` [s]."""
-        return self.distance(receiver) / SPEED_OF_LIGHT
+    @classmethod
+    def line_of_sight(
+        cls, tx: Tensor, frequency: float, *, level_db: float = 0.0, open_above: float = 0.1
+    ) -> "PointSources":
+        """The transmitter alone, at `tx` `[3]` [m] and `frequency` [Hz]."""
+        none = Planes(torch.zeros(0, 3), torch.zeros(0))
+        row = torch.full((1, HIGHEST_ORDER), -1)
+        return cls(tx, frequency, none, None, row, torch.zeros(0, 3), level_db, open_above)
 
-    def arrival(self, receiver: Tensor) -> Tensor:
-        """Unit vectors `[*batch, 3]` from the receivers towards the source."""
-        return torch.nn.functional.normalize(self.position - receiver, dim=-1)
+    def __len__(self) -> int:
+        return len(self.sequence)
 
-    def departure(self, receiver: Tensor) -> Tensor:
-        """Unit vectors `[*batch, 3]` along which the waves leave the transmitter."""
-        return -self.arrival(receiver)
+    @cached_property
+    def chain(self) -> Tensor:
+        """The transmitter's images `[K, 4, 3]` [m] after 0 to 3 reflections of each sequence."""
+        return image_chain(self.tx, self.planes.normals, self.planes.offsets, self.sequence)
 
-    def gain(self, receiver: Tensor, frequency: float) -> Tensor:
-        """Path gain `[*batch]`, linear, where nothing is in the way: Friis times `gain_db`."""
-        return friis_gain(self.distance(receiver), frequency) * 10.0 ** (self.gain_db / 10.0)
+    @property
+    def positions(self) -> Tensor:
+        """Where the sources seem to stand `[K, 3]` [m]."""
+        return self.chain[:, -1]
 
-    def visible(self, receiver: Tensor, obstacles: Obstacles) -> Tensor:
-        """True `[*batch]` where the segment from the source to the receiver is open."""
-        return self.transmittance(receiver, obstacles) > self.open_above
+    @cached_property
+    def order(self) -> Tensor:
+        """Number of reflections `[K]`."""
+        return (self.sequence >= 0).sum(-1)
 
-    def transmittance(self, receiver: Tensor, obstacles: Obstacles) -> Tensor:
-        """Share `[*batch]` that the Gaussians let through between source and receivers, without end pieces of 10 cm."""
-        flat = receiver.reshape(-1, 3)
-        start = self.position.expand_as(flat)
-        return obstacles.transmittance(start, flat).reshape(receiver.shape[:-1])
+    def folded(self, receivers: Tensor) -> tuple[Folded, Tensor]:
+        """The broken lines to receivers `[*batch, 3]`, and where all their points lie on surface `[*batch, K]`."""
+        lines = fold(self.chain, self.planes.normals, self.planes.offsets, self.sequence, receivers)
+        good = lines.possible
+        if self.patches is not None:
+            for step in range(int(self.order.max())):
+                plane = self.sequence[:, step].expand(good.shape)
+                asked = torch.nonzero(good & (plane >= 0), as_tuple=True)
+                good[asked] = self.patches.holds(lines.points[..., step, :][asked], plane[asked])
+        return lines, good
 
-    def beam(self, directions: Tensor, receiver: Tensor, instrument: Instrument) -> Tensor:
-        """Relative power `[*shape]` seen by an instrument at `receiver` `[3]` along world directions `[*shape, 3]`."""
-        return instrument.kernel(angle_between(directions, self.arrival(receiver).expand_as(directions)))
+    def gain(self, source: Tensor, distance: Tensor, cosine: Tensor) -> Tensor:
+        """Path gain `[n]`, linear, of open ways of `distance` `[n]` [m] over reflections at `cosine` `[n, 3]`."""
+        level_db = self.level_db + self.reflection_db(source, cosine).sum(-1)
+        return friis_gain(distance, self.frequency) * 10.0 ** (level_db / 10.0)
 
+    def reflection_db(self, source: Tensor, cosine: Tensor) -> Tensor:
+        """10 log10 Gamma `[n, 3]` of each reflection of sources `[n]`, 0 beyond the last."""
+        plane = self.sequence[source]
+        if not len(self.planes):
+            return torch.zeros_like(cosine)
+        a, b, c = self.reflection[plane.clamp_min(0)].unbind(-1)
+        return torch.where(plane >= 0, (a + b * cosine + c * cosine * cosine).clamp_max(0.0), 0.0)
 
-def fit_line_of_sight(source: PointSource, spectra: Spectrum) -> tuple[PointSource, Tensor]:
-    """The source with its level fitted to `spectra` `[position, row, col]`, and where the spectra see it `[position]`.
+    def transmittance(self, source: Tensor, points: Tensor, receivers: Tensor, obstacles: Obstacles) -> Tensor:
+        """Share `[n]` that passes on the ways from the transmitter over `points` `[n, 3, 3]` to `receivers` `[n, 3]`.
 
-    At each position the beam's power is what stands within half a lobe of the source's direction over the median of
-    the ring around it (2 to 4 lobes), solved for by least squares. A position sees the source when that power lies 3 dB
-    over the ring and within 6 dB of the median level over Friis of such positions; that median is the fitted level.
-    When no position sees the source it keeps its level.
-    """
-    excess, over_ring = [], []
-    centre = spectra.pose.position
-    for index in range(len(spectra)):
-        one = spectra[index]
-        angle = angle_between(one.directions, source.arrival(centre[index]).expand_as(one.directions))
-        lobe = spectra.instrument.lobe
-        near = angle < max(0.5 * lobe, 0.75 * _pixel(spectra))
-        ring = (angle > 2 * lobe) & (angle < 4 * lobe)
-        if not bool(near.any()) or not bool(ring.any()):
-            excess.append(float("nan"))
-            over_ring.append(0.0)
-            continue
-        level = one.power[ring].double().median()
-        kernel = spectra.instrument.kernel(angle[near]).double()
-        power = (kernel * (one.power[near].double() - level)).sum() / (kernel * kernel).sum()
-        free = friis_gain(source.distance(centre[index]), spectra.frequency).double()
-        excess.append(float(10 * torch.log10((power / free).clamp_min(1e-30))))
-        over_ring.append(float(power / level.clamp_min(1e-30)))
-    level_db, contrast = torch.tensor(excess), torch.tensor(over_ring)
-    seen = torch.isfinite(level_db) & (contrast > 2.0)
-    if not bool(seen.any()):
-        return source, seen
-    median = level_db[seen].median()
-    seen &= (level_db - median).abs() < 6.0
-    return replace(source, gain_db=float(level_db[seen].median())), seen
+        The product over the legs of a way; Gaussians of the planes that a leg joins do not stand in its way.
+        """
+        plane = self.sequence[source]
+        last = self.order[source]
+        stops = torch.cat((self.tx.expand(len(source), 1, 3), points, receivers[:, None]), 1)
+        labels = torch.nn.functional.pad(plane, (1, 1), value=-1)
+        leg = torch.arange(HIGHEST_ORDER + 1)
+        way, step = torch.nonzero(leg <= last[:, None], as_tuple=True)
+        ends = {} if obstacles.labels is None else {"skip_start": labels[way, step], "skip_end": labels[way, step + 1]}
+        passed = obstacles.transmittance(stops[way, step], stops[way, step + 1], **ends)
+        whole = passed.new_ones(len(source), HIGHEST_ORDER + 1)
+        whole[way, step] = passed
+        return whole.prod(-1)
 
+    def rays(self, receiver: Tensor, obstacles: Obstacles) -> Rays:
+        """What reaches a receiver at `receiver` `[3]` [m]."""
+        return self.rays_each(receiver[None], obstacles)[0]
 
-def fit_opening(source: PointSource, seen: Tensor, positions: Tensor, obstacles: Obstacles) -> PointSource:
-    """The source with the transmittance threshold that agrees best with where training spectra see it `[position]`."""
-    passed = source.transmittance(positions, obstacles)
-    thresholds = torch.tensor([0.1, 0.05, 0.2, 0.02, 0.3, 0.01, 0.5])
-    agreement = ((passed[None] > thresholds[:, None]) == seen[None]).sum(-1)
-    return replace(source, open_above=float(thresholds[agreement.argmax()]))
-
-
-def estimate_transmitter(spectra: Spectrum, *, tolerance: float | None = None) -> Pose:
-    """Where the transmitter stands, from each position's strongest bearing: RANSAC over all pairs, then least squares.
-
-    `tolerance` [rad] is how far a bearing may point past the transmitter and still count; None is half a lobe or one
-    pixel. The pose's orientation is the world's, since bearings do not tell it. Raises InputError for fewer than three
-    positions or when fewer than three bearings meet in one point.
-    """
-    if not spectra.pose.batch_shape or len(spectra) < 3:
-        raise InputError("estimating the transmitter needs spectra at three or more positions; give tx instead")
-    origin = spectra.pose.position.double()
-    bearing = torch.nn.functional.normalize(main_peak(spectra).double(), dim=-1)
-    limit = max(0.5 * spectra.instrument.lobe, _pixel(spectra)) if tolerance is None else tolerance
-    candidates = _pairwise_meetings(origin, bearing)
-    best, most = candidates[0], -1
-    for chunk in candidates.split(4096):
-        inliers = (_bearing_error(chunk[:, None], origin, bearing) < limit).sum(-1)
-        if int(inliers.max()) > most:
-            best, most = chunk[int(inliers.argmax())], int(inliers.max())
-    if most < 3:
-        raise InputError(
-            f"the strongest bearings of {len(spectra)} positions do not meet in one point (at most {most} agree within "
-            f"{torch.rad2deg(torch.tensor(limit)):.1f} deg); give tx, or spectra that see the transmitter"
+    def rays_each(self, receivers: Tensor, obstacles: Obstacles, *, in_sight: Tensor | None = None) -> list[Rays]:
+        """What reaches each of the receivers `[n, 3]` [m]; `in_sight` `[n]` decides the line of sight where given."""
+        lines, good = self.folded(receivers)
+        place, source = torch.nonzero(good, as_tuple=True)
+        points = lines.points[place, source]
+        open_way = self.transmittance(source, points, receivers[place], obstacles) > self.open_above
+        if in_sight is not None:
+            open_way = torch.where(source == 0, in_sight[place], open_way)
+        place, source, points = place[open_way], source[open_way], points[open_way]
+        distance, cosine = lines.distance[place, source], lines.cosine[place, source]
+        rays = Rays(
+            source,
+            self.gain(source, distance, cosine),
+            lines.arrival[place, source],
+            lines.departure[place, source],
+            distance / SPEED_OF_LIGHT,
+            self.order[source],
+            points,
         )
-    for _ in range(20):
-        error = _bearing_error(best[None], origin, bearing)
-        spread = error[error < limit].median().clamp_min(1e-4)
-        inlier = error < torch.clamp(4 * spread, max=limit)
-        best = _closest_point(origin[inlier], bearing[inlier], best)
-    return Pose(best.float())
+        if len(receivers) == 1:
+            return [rays]
+        return [rays.only(place == number) for number in range(len(receivers))]
 
-
-def _pixel(spectra: Spectrum) -> float:
-    return 0.0 if spectra.grid.kind == "list" else spectra.grid.spacing
-
-
-def _bearing_error(point: Tensor, origin: Tensor, bearing: Tensor) -> Tensor:
-    towards = point - origin
-    return angle_between(towards, bearing.expand_as(towards))
-
-
-def _pairwise_meetings(origin: Tensor, bearing: Tensor) -> Tensor:
-    """Midpoints `[pair, 3]` of the shortest links between all pairs of bearings that converge ahead of both."""
-    first, second = torch.triu_indices(len(origin), len(origin), 1)
-    if len(first) > 200_000:
-        chosen = torch.randperm(len(first), generator=torch.Generator().manual_seed(0))[:200_000]
-        first, second = first[chosen], second[chosen]
-    link, u, v = origin[second] - origin[first], bearing[first], bearing[second]
-    cosine = (u * v).sum(-1)
-    sine2 = (1 - cosine * cosine).clamp_min(1e-12)
-    along_u = ((link * u).sum(-1) - cosine * (link * v).sum(-1)) / sine2
-    along_v = (cosine * (link * u).sum(-1) - (link * v).sum(-1)) / sine2
-    usable = (sine2 > 1e-3) & (along_u > 0) & (along_v > 0)
-    if not bool(usable.any()):
-        raise InputError("the strongest bearings are parallel or diverge; give tx, or spectra from more positions")
-    middle = 0.5 * (origin[first] + along_u[:, None] * u + origin[second] + along_v[:, None] * v)
-    return middle[usable]
-
-
-def _closest_point(origin: Tensor, bearing: Tensor, start: Tensor) -> Tensor:
-    """The point with the least sum of squared angles: distances from the bearings' lines, weighted by 1 / range^2."""
-    across = torch.eye(3, dtype=origin.dtype) - bearing[:, :, None] * bearing[:, None, :]
-    weight = 1.0 / (start - origin).square().sum(-1).clamp_min(1e-6)
-    normal = (weight[:, None, None] * across).sum(0)
-    right = (weight[:, None] * torch.einsum("nij,nj->ni", across, origin)).sum(0)
-    return torch.linalg.lstsq(normal, right).solution
+    def sees(self, receivers: Tensor, obstacles: Obstacles) -> Tensor:
+        """True `[*batch]` where the line of sight to receivers `[*batch, 3]` is open."""
+        flat = receivers.reshape(-1, 3)
+        passed = obstacles.transmittance(self.tx.expand_as(flat), flat)
+        return (passed > self.open_above).reshape(receivers.shape[:-1])

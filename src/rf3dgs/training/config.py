@@ -8,8 +8,15 @@ from rf3dgs.core.errors import InputError
 
 @dataclass(frozen=True)
 class RadioConfig:
-    """The radio stage: opacity and CSI-encoded harmonics on frozen geometry."""
+    """The radio stage: spectra on frozen geometry.
 
+    The settings from `encoding` to `train_opacity` belong to the paper's model, as `steps` and `csi_every` do; the
+    mirror model is fitted in closed form and has none of them.
+    """
+
+    model: Literal["mirror", "paper"] = "paper"
+    """"mirror": the transmitter's mirror images as point sources, and surfaces that scatter by laws of their own;
+    "paper": harmonics in a dB window on every Gaussian, the line of sight as a point source."""
     steps: int = 1000
     """Iterations; each takes the picture of one training position, a whole sphere or a pinhole's."""
     csi_every: int = 2
@@ -179,3 +186,29 @@ class VisualConfig:
     """Which rasterizer works."""
     checkpoint_every: int = 1_000
     """Iterations between checkpoints when a checkpoint folder is given."""
+
+
+@dataclass(frozen=True)
+class SourceConfig:
+    """Which mirror images of the transmitter are point sources, and how they are fitted."""
+
+    order: int = 2
+    """Most reflections of a way; 0 is the line of sight alone. Order 3 is tried over the largest planes only."""
+    largest: int = 6
+    """Over how many of the largest planes ways of order 3 are tried."""
+    planes: int = 40
+    """The largest planes that are mirrors; smaller ones only block."""
+    complete: bool = True
+    """Whether mirrors that the geometry lacks are found where secondary peaks of the spectra meet."""
+    refine: bool = True
+    """Whether planes are moved, within what geometry allows, to where the peaks of their images are."""
+    plane_error: float = 0.03
+    """How far a plane of the geometry may lie off [m], one standard deviation."""
+    plane_error_deg: float = 1.0
+    """How far it may be turned [deg], one standard deviation."""
+    least_db: float = 40.0
+    """Sources that stay so many dB under the strongest part of the spectrum everywhere are left out."""
+    most: int = 200
+    """At most so many sources are kept, the strongest ones."""
+    seed: int = 0
+    """Decides the receivers at which sources are tried out."""

@@ -34,6 +34,7 @@ class Scattering:
     and the numbers of segments and cells `[N]`."""
 
     means: Tensor
+    normals: Tensor
     distance: Tensor
     cosine: Tensor
     mirrored: Tensor
@@ -43,9 +44,12 @@ class Scattering:
     tx: Tensor
 
     @classmethod
-    def of(cls, means: Tensor, normals: Tensor, visibility: Tensor, segment_of: Tensor, cell_of: Tensor, tx: Tensor) -> "Scattering":
+    def of(
+        cls, means: Tensor, normals: Tensor, visibility: Tensor, segment_of: Tensor, cell_of: Tensor, tx: Tensor
+    ) -> "Scattering":
+        """The geometry of Gaussians at `means` with unit `normals` `[N, 3]` under a transmitter at `tx` `[3]` [m]."""
         distance, cosine, mirrored = incidence(means, normals, tx)
-        return cls(means, distance, cosine, mirrored, visibility, segment_of, cell_of, tx)
+        return cls(means, normals, distance, cosine, mirrored, visibility, segment_of, cell_of, tx)
 
 
 def fit_laws(scattering: Scattering, seen: Observations) -> Tensor:
@@ -142,8 +146,19 @@ def _refine(
     return laws
 
 
+@dataclass(frozen=True)
+class Ridge:
+    """How strongly each level of the residual is drawn to zero, in pixels that say so."""
+
+    segment: float = 100.0
+    cell: float = 100.0
+    level: float = 5.0
+
+
+RIDGE = Ridge()
+
 def fit_residual(
-    scattering: Scattering, seen: Observations, laws: Tensor, ridge: "Ridge"
+    scattering: Scattering, seen: Observations, laws: Tensor, ridge: Ridge = RIDGE
 ) -> tuple[Tensor, Tensor, Tensor]:
     """segment_sh `[S, 16]`, cell_sh `[C, 16]` and level `[N]` of what the laws leave over, in dB."""
     count = len(scattering.means)
@@ -178,16 +193,7 @@ def fit_residual(
     return fitted[0], fitted[1], level.clamp(-LARGEST_RESIDUAL_DB, LARGEST_RESIDUAL_DB)
 
 
-@dataclass(frozen=True)
-class Ridge:
-    """How strongly each level of the residual is drawn to zero, in pixels that say so."""
-
-    segment: float = 100.0
-    cell: float = 100.0
-    level: float = 5.0
-
-
-def fit_ambient(scattering: Scattering, seen: Observations, laws: Tensor, ridge: float) -> Tensor:
+def fit_ambient(scattering: Scattering, seen: Observations, laws: Tensor, ridge: float = 1.0) -> Tensor:
     """Delay [ns] up to the Gaussian and departure vector `[N, 4]` of the ambient part: what is left of the observed
     means when the lit part's own are taken out, segment, cell, then Gaussian."""
     count = len(scattering.means)

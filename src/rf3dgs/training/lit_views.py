@@ -11,17 +11,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import View, view_of
 from rf3dgs.field.lit import BLENDING
 from rf3dgs.field.radiance import NANOSECOND
-from rf3dgs.field.sources import PointSource
+from rf3dgs.field.sources import Rays
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.rasterize import Backend, rasterize
+from rf3dgs.training.radio_views import ruled
 
-MASKED_SHARE = 0.3
 LEAST_WEIGHT = 0.02  # [pixel]; what a view tells of fainter Gaussians is left out
 LEAST_POWER = 1e-30
 
@@ -57,31 +56,28 @@ class Observations:
         return len(self.gaussian)
 
 
-def lit_views(spectra: Spectrum, sources: Sequence[tuple[PointSource, Tensor]]) -> list[LitView]:
-    """The views of `spectra` `[position, row, col]`; `sources`: point sources and where each is seen `[position]`."""
+def lit_views(spectra: Spectrum, rays: Sequence[Rays] | None) -> list[LitView]:
+    """The views of `spectra` `[position, row, col]`; `rays`: what reaches each position from point sources."""
     if spectra.grid.kind == "list":
         raise InputError("the radio stage needs pinhole or equirectangular spectra; got a list of directions")
-    hidden = [[source for source, seen in sources if bool(seen[index])] for index in range(len(spectra))]
-    return [_view(spectra[index], hidden[index]) for index in range(len(spectra))]
+    return [_view(spectra[index], None if rays is None else rays[index]) for index in range(len(spectra))]
 
 
-def _view(one: Spectrum, sources: Sequence[PointSource]) -> LitView:
+def _view(one: Spectrum, rays: Rays | None) -> LitView:
     area = one.grid.solid_angle / one.grid.solid_angle.mean()
-    here, power = one.pose.position, one.power.double()[..., None]
-    channels, points = power, torch.zeros_like(power[..., 0])
+    power = one.power.double()[..., None]
+    channels = power
     if one.delay is not None and one.aod is not None:
-        late = one.delay.double()[..., None] / NANOSECOND
-        channels = torch.cat((power, power * late, power * one.aod.double()), -1)
-    for source in sources:
-        beam = source.beam(one.directions, here, one.instrument)
-        share = (beam * source.gain(here, one.frequency)).double()[..., None]
-        parts = [share, share * source.delay(here) / NANOSECOND, share * source.departure(here)]
-        points = points + share[..., 0]
-        channels = channels - torch.cat(parts, -1)[..., : channels.shape[-1]]
-        angle = angle_between(one.directions, source.arrival(here).expand_as(one.directions))
-        points = torch.where(angle < one.instrument.lobe, power[..., 0], points)
-    keep = area * (points < MASKED_SHARE * power[..., 0]) * (channels[..., 0] > 0)
-    return LitView(view_of(one.pose, one.grid), keep, channels)
+        channels = torch.cat((power, power * one.delay.double()[..., None] / NANOSECOND, power * one.aod.double()), -1)
+    keep = area.clone()
+    if rays is not None and len(rays):
+        keep = area * ~ruled(one, rays)[1]
+        place, ray, share = rays.shares(one.directions, one.instrument)
+        known = torch.cat((torch.ones(len(rays), 1), rays.delay[:, None] / NANOSECOND, rays.departure), -1)
+        taken = (share[:, None] * known[ray])[:, : channels.shape[-1]].double()
+        flat = channels.reshape(-1, channels.shape[-1]).index_add(0, place, -taken)
+        channels = flat.reshape(channels.shape)
+    return LitView(view_of(one.pose, one.grid), keep * (channels[..., 0] > 0), channels)
 
 
 def observe(geometry: Gaussians, views: Sequence[LitView], *, unit: float, backend: Backend = "auto") -> Observations:

@@ -1,46 +1,113 @@
-"""The mirror model's radio stage: spectra and frozen geometry to a `RadioField` whose parts are laws of physics."""
+"""The mirror model's radio stage: spectra and frozen geometry to a `RadioField` whose parts are laws of physics.
+
+Closed form throughout: surfaces of the geometry, point sources (the transmitter and its mirror images), and then the
+surface part on what the point sources leave over. The same spectra and geometry give the same field.
+"""
 
 import torch
 from torch import Tensor
 
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.progress import Progress
+from rf3dgs.field.lit import LitSurface
+from rf3dgs.field.radio_field import RadioField
+from rf3dgs.geometry import Surfaces, find_surfaces
+from rf3dgs.spectra.codec import DbWindow
+from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
-from rf3dgs.splats.surface import normals
-from rf3dgs.splats.transmittance import segment_transmittance
-from rf3dgs.training.planes import find_planes
+from rf3dgs.splats.obstacles import Obstacles, visibility_of
+from rf3dgs.training.config import RadioConfig
+from rf3dgs.training.lit_fit import Scattering, fit_ambient, fit_laws, fit_residual
+from rf3dgs.training.lit_views import LitView, lit_views, observe
+from rf3dgs.training.source_fit import fit_sources
 
-CELL = 0.8
+CELL = 0.8  # m
+STAGES = ("surfaces", "point sources", "observations", "laws", "residual")
 
 
-def simple_surfaces(geometry: Gaussians, viewpoints: Tensor) -> tuple[Tensor, Tensor]:
-    """normals [N, 3] turned to the viewpoints and segment_of [N]"""
-    normal = normals(geometry)
-    centre = viewpoints.mean(0)
-    planes = find_planes(geometry.means, 0.04, 40, torch.Generator().manual_seed(0))
-    distance = (geometry.means @ planes.normals.mT - planes.offsets).abs()
-    aligned = (normal @ planes.normals.mT).abs() > 0.9
-    score = torch.where(aligned & (distance < 0.06), distance, torch.inf)
-    best, plane = score.min(1)
-    on = torch.isfinite(best)
-    normal = torch.where(on[:, None], planes.normals[plane], normal)
-    normal = normal * torch.where(((centre - geometry.means) * normal).sum(-1) < 0, -1.0, 1.0)[:, None]
-    cellkey = torch.floor(geometry.means / 1.0).long()
-    axis = normal.abs().argmax(-1)
-    sign = (normal.gather(1, axis[:, None])[:, 0] > 0).long()
-    side = ((planes.normals[plane] * normal).sum(-1) > 0).long()
-    key = torch.cat((cellkey, (axis * 2 + sign)[:, None], torch.full((len(normal), 1), -1)), -1)
-    key = torch.where(on[:, None], torch.stack((plane * 0, plane * 0, plane * 0, side, plane), -1), key)
-    return normal, torch.unique(key, dim=0, return_inverse=True)[1]
+def fit_mirror(
+    geometry: Gaussians,
+    spectra: Spectrum,
+    config: RadioConfig,
+    tx: Pose,
+    window: DbWindow,
+    colour: Tensor,
+    meta: dict[str, str | int | float | bool],
+    progress: Progress,
+) -> RadioField:
+    """The mirror model of checked `spectra` over checked `geometry`; see `fit_radio`.
+
+    `window` is that of the field's pictures, `colour` `[N, 3]` uint8 how a viewer paints it, `meta` what is known of
+    the run.
+    """
+    progress.start("radio stage", len(STAGES))
+    positions = spectra.pose.position
+    surfaces = find_surfaces(geometry, positions)
+    progress.update(1)
+    obstacles = Obstacles(
+        geometry.means, geometry.quats, geometry.scales, geometry.opacities, surfaces.plane_of
+    )
+    found = fit_sources(spectra, surfaces, obstacles, tx)
+    progress.update(2)
+    views = lit_views(spectra, found.rays)
+    surface = fit_surface(geometry, surfaces, obstacles, views, tx.position, window, config, progress)
+    progress.finish()
+    return RadioField(
+        surface=surface,
+        sources=found.sources,
+        plane_of=found.plane_of,
+        solidity=geometry.opacities.detach(),
+        frequency=spectra.frequency,
+        instrument=spectra.instrument,
+        tx=tx,
+        bounds=torch.stack((positions.amin(0), positions.amax(0))),
+        colour=colour,
+        meta=meta | {"positions in sight": int(found.seen.sum()), "segments": len(surface.laws)},
+        backend=config.backend,
+    )
+
+
+def fit_surface(
+    geometry: Gaussians,
+    surfaces: Surfaces,
+    obstacles: Obstacles,
+    views: list[LitView],
+    tx: Tensor,
+    window: DbWindow,
+    config: RadioConfig,
+    progress: Progress,
+) -> LitSurface:
+    """The surface part of the model, fitted to `views`, in which point sources are already taken out."""
+    visibility = visibility_of(obstacles, geometry.means, surfaces.normals, tx, surfaces.plane_of)
+    cells = cells_of(geometry.means, surfaces.segment_of)
+    scattering = Scattering.of(geometry.means, surfaces.normals, visibility, surfaces.segment_of, cells, tx)
+    seen = observe(geometry, views, unit=10 ** (window.ceil_db / 10), backend=config.backend)
+    progress.update(3)
+    laws = fit_laws(scattering, seen)
+    progress.update(4)
+    segment_sh, cell_sh, level = fit_residual(scattering, seen, laws)
+    ambient = fit_ambient(scattering, seen, laws)
+    progress.update(5)
+    return LitSurface(
+        means=geometry.means.detach(),
+        quats=geometry.quats.detach(),
+        log_scales=geometry.log_scales.detach(),
+        logit_opacities=geometry.logit_opacities.detach(),
+        normals=scattering.normals,
+        visibility=scattering.visibility,
+        segment_of=scattering.segment_of,
+        cell_of=scattering.cell_of,
+        laws=laws,
+        segment_sh=segment_sh,
+        cell_sh=cell_sh,
+        level=level,
+        ambient=ambient,
+        tx=tx,
+        window=window,
+    )
 
 
 def cells_of(means: Tensor, segment_of: Tensor) -> Tensor:
-    """The cell of 0.8 m of each Gaussian within its segment."""
+    """The cell `[N]` of each Gaussian: a number, from 0 without gaps, for every cube of 0.8 m of every segment."""
     key = torch.cat((torch.floor(means / CELL).long(), segment_of[:, None]), -1)
     return torch.unique(key, dim=0, return_inverse=True)[1]
-
-
-def visibility_of(geometry: Gaussians, normal: Tensor, tx: Tensor) -> Tensor:
-    start = geometry.means + 0.08 * normal
-    passed = segment_transmittance(
-        geometry.means, geometry.quats, geometry.scales, geometry.opacities, start, tx[None].expand_as(start), stop_short=0.05
-    )
-    return passed * ((tx - geometry.means) * normal).sum(-1).gt(0)

@@ -16,7 +16,8 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.field.radiance import Surface
 from rf3dgs.field.radio_field import RadioField
-from rf3dgs.field.sources import PointSource, estimate_transmitter, fit_line_of_sight, fit_opening
+from rf3dgs.field.sources import PointSources
+from rf3dgs.field.transmitter import estimate_transmitter
 from rf3dgs.spectra.codec import DbWindow, PaperEncoding, window_of
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.detail import level_of_detail
@@ -26,8 +27,10 @@ from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.checkpoint import fingerprint
 from rf3dgs.training.config import RadioConfig
 from rf3dgs.training.loop import train
+from rf3dgs.training.mirror import fit_mirror
 from rf3dgs.training.radio_stage import RadioStage
 from rf3dgs.training.radio_views import radio_views
+from rf3dgs.training.source_fit import fit_sources
 
 MANY = 150_000  # Gaussians beyond which their level of detail is worth its pass
 
@@ -59,11 +62,19 @@ def fit_radio(
     estimated = where is None
     where = estimate_transmitter(spectra) if where is None else where
     window = _window(spectra, config)
-    obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, geometry.opacities)
-    sources, seen = (), torch.zeros(len(spectra), dtype=torch.bool)
+    meta: dict[str, str | int | float | bool] = {
+        "model": config.model,
+        "seed": config.seed,
+        "positions": len(spectra),
+        "transmitter": "estimated" if estimated else "given",
+        "Gaussians given": given,
+    }
+    if config.model == "mirror":
+        return fit_mirror(geometry, spectra, config, where, window, _colour(geometry), meta, progress)
+    found = None
     if config.line_of_sight == "source":
-        source, seen = fit_line_of_sight(PointSource(where.position, where.position), spectra)
-        sources = (fit_opening(source, seen, spectra.pose.position, obstacles),)
+        obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, geometry.opacities)
+        found = fit_sources(spectra, None, obstacles, where)
     span = PaperEncoding.of(spectra).delay_span if config.encoding == "paper" and spectra.delay is not None else 1e-7
     bare = Surface.bare(
         geometry,
@@ -76,7 +87,7 @@ def fit_radio(
     views = radio_views(
         spectra,
         window,
-        sources=[(source, seen) for source in sources],
+        rays=None if found is None else found.rays,
         encoding=PaperEncoding(window, span) if config.encoding == "paper" else None,
     )
     stage = RadioStage(bare, views, config)
@@ -99,17 +110,11 @@ def fit_radio(
         checkpoint_dir=checkpoint_dir,
         every_steps=config.checkpoint_every,
     )
-    meta = {
-        "steps": config.steps,
-        "seed": config.seed,
-        "positions": len(spectra),
-        "transmitter": "estimated" if estimated else "given",
-        "positions in sight": int(seen.sum()),
-        "Gaussians given": given,
-    }
+    meta |= {"steps": config.steps, "positions in sight": 0 if found is None else int(found.seen.sum())}
     return RadioField(
         surface=stage.surface(),
-        sources=sources,
+        sources=None if found is None else found.sources,
+        plane_of=None if found is None else found.plane_of,
         solidity=geometry.opacities.detach(),
         frequency=spectra.frequency,
         instrument=spectra.instrument,

@@ -12,7 +12,7 @@ from torch import Tensor
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import View, view_of
-from rf3dgs.field.sources import PointSource
+from rf3dgs.field.sources import Rays
 from rf3dgs.spectra.codec import DbWindow, PaperEncoding
 from rf3dgs.spectra.spectrum import Spectrum
 
@@ -39,35 +39,46 @@ def radio_views(
     spectra: Spectrum,
     window: DbWindow,
     *,
-    sources: Sequence[tuple[PointSource, Tensor]] = (),
+    rays: Sequence[Rays] | None = None,
     encoding: PaperEncoding | None = None,
 ) -> list[RadioView]:
-    """The views of `spectra` `[position, row, col]`; `sources`: point sources and where each is seen `[position]`.
+    """The views of `spectra` `[position, row, col]`; `rays`: what reaches each position from point sources.
 
     `encoding` asks for the paper's CSI channels; None for delay [ns] and the departure vector.
     """
     if spectra.grid.kind == "list":
         raise InputError("the radio stage needs pinhole or equirectangular spectra; got a list of directions")
-    hidden = [[source for source, seen in sources if bool(seen[index])] for index in range(len(spectra))]
-    return [_view(spectra[index], window, hidden[index], encoding) for index in range(len(spectra))]
+    each = [None] * len(spectra) if rays is None else rays
+    return [_view(spectra[index], window, each[index], encoding) for index in range(len(spectra))]
 
 
-def _view(one: Spectrum, window: DbWindow, sources: Sequence[PointSource], encoding: PaperEncoding | None) -> RadioView:
+def ruled(one: Spectrum, rays: Rays) -> tuple[Tensor, Tensor]:
+    """Power `[row, col]` that point sources send into a spectrum `[row, col]`, and the pixels that they rule: where it
+    is 30 % of the spectrum's or more, and a lobe around the line of sight.
+    """
+    share = rays.picture(one.directions, one.instrument).double()
+    rule = share >= MASKED_SHARE * one.power
+    for arrival in rays.arrival[rays.order == 0]:
+        angle = angle_between(one.directions, arrival.expand_as(one.directions))
+        rule = rule | (angle <= MASKED_LOBES * one.instrument.lobe)
+    return share, rule
+
+
+def _view(one: Spectrum, window: DbWindow, rays: Rays | None, encoding: PaperEncoding | None) -> RadioView:
     """The picture of one spectrum: point sources are taken out, and the pixels that they rule do not count."""
     area = one.grid.solid_angle / one.grid.solid_angle.mean()
     power, whole = one.power.double(), torch.ones_like(one.power, dtype=torch.bool)
     has_csi = one.delay is not None and one.aod is not None
     delay = one.delay.double() * power if one.delay is not None else power
     aod = one.aod.double() * power[..., None] if one.aod is not None else power[..., None]
-    for source in sources:
-        here = one.pose.position
-        beam = source.beam(one.directions, here, one.instrument)
-        share = (beam * source.gain(here, one.frequency)).double()
-        angle = angle_between(one.directions, source.arrival(here).expand_as(one.directions))
-        whole = whole & (share < MASKED_SHARE * one.power) & (angle > MASKED_LOBES * one.instrument.lobe)
-        power = power - share
-        delay = delay - share * source.delay(here)
-        aod = aod - share[..., None] * source.departure(here)
+    if rays is not None and len(rays):
+        sent, rule = ruled(one, rays)
+        whole, power = ~rule, power - sent
+        if has_csi:
+            place, ray, share = rays.shares(one.directions, one.instrument)
+            late, turned = share * rays.delay[ray], share[:, None] * rays.departure[ray]
+            delay = delay.flatten().index_add(0, place, -late.double()).reshape(delay.shape)
+            aod = aod.reshape(-1, 3).index_add(0, place, -turned.double()).reshape(aod.shape)
     csi = None
     if has_csi and encoding is not None:
         csi = encoding.encode(one)[..., 1:]

@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
 from rf3dgs.core.grids import Camera
+from rf3dgs.geometry.planes import Planes, directions_of, find_planes
 from rf3dgs.training.photographs import shrunk
-from rf3dgs.training.planes import Planes, directions_of, find_planes
 
 PIXELS_ACROSS = 107
 DEPTHS = 80

@@ -1,4 +1,4 @@
-"""The large planes among surface points: walls, floors, ceilings, table tops."""
+"""Planes, and the large ones among surface points: walls, floors, ceilings, table tops."""
 
 from dataclasses import dataclass
 

@@ -1,0 +1,260 @@
+"""What the peaks of spectra say about mirrors: where known planes lie exactly, and planes that geometry lacks.
+
+A mirror shows the transmitter at its image, a fixed point for all receivers, so that the bearings of its peaks meet
+there. The plane is the bisector of transmitter and image.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rf3dgs.core.angles import angle_between
+from rf3dgs.field.images import mirrored
+from rf3dgs.field.sources import PointSources, Rays
+from rf3dgs.field.transmitter import bearing_error, closest_point, pairwise_meetings, pixel_of
+from rf3dgs.geometry import Patches, Planes
+from rf3dgs.geometry.patches import CELL
+from rf3dgs.spectra.peaks import find_peaks
+from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.splats.obstacles import Obstacles
+from rf3dgs.training.config import SourceConfig
+from rf3dgs.training.line_of_sight import SEEN_OVER_RING, standing_out
+
+PEAKS = 16
+MATCH = math.radians(3.0)
+BEARING = math.radians(0.3)
+STEPS = 6
+LEAST_SUPPORT, LEAST_SHARE = 5, 0.1
+MOST_FOUND = 12
+SAME_ANGLE, SAME_DISTANCE = math.cos(math.radians(5.0)), 0.2
+SPOT = 0.3
+DISC = 4  # cells of surface around a reflection that was seen
+NEAREST_IMAGE = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Peaks:
+    """Peaks that stand 3 dB over their surroundings: position `[n]`, bearing `[n, 3]` (world) of each."""
+
+    position: Tensor
+    bearing: Tensor
+
+    def only(self, chosen: Tensor) -> "Peaks":
+        """Some of them, by a mask or list."""
+        return Peaks(self.position[chosen], self.bearing[chosen])
+
+
+def peaks_of(spectra: Spectrum) -> Peaks:
+    """The strongest peaks of spectra `[position, row, col]`."""
+    positions, bearings = [], []
+    for number in range(len(spectra)):
+        one = spectra[number]
+        found, _ = find_peaks(one.power, one.grid, count=PEAKS, separation=one.instrument.lobe)
+        for bearing in one.pose.to_world(found):
+            power, ring = standing_out(one, bearing)
+            if power > (SEEN_OVER_RING - 1) * ring:
+                positions.append(number)
+                bearings.append(bearing)
+    where = torch.tensor(positions, dtype=torch.long)
+    return Peaks(where, torch.stack(bearings) if bearings else torch.zeros(0, 3))
+
+
+def refined_planes(
+    sources: PointSources, rays: list[Rays], peaks: Peaks, positions: Tensor, config: SourceConfig
+) -> Planes:
+    """The planes, each moved to where the peaks of its image are, with what geometry says as a prior.
+
+    Least squares over two tilts about the middle of the reflections and an offset; a peak belongs to the ray that is
+    nearest to it, at most 3 degrees away. Planes of fewer than three such peaks stay.
+    """
+    matches: dict[int, list[tuple[Tensor, Tensor, Tensor]]] = {}
+    for number, one in enumerate(rays):
+        own = peaks.bearing[peaks.position == number]
+        if not len(own) or not len(one):
+            continue
+        angle = angle_between(one.arrival[:, None], own[None])
+        for ray in torch.nonzero(one.order == 1).squeeze(-1).tolist():
+            nearest = int(angle[ray].argmin())
+            if float(angle[ray, nearest]) < MATCH and int(angle[:, nearest].argmin()) == ray:
+                plane = int(sources.sequence[one.index[ray], 0])
+                matches.setdefault(plane, []).append((positions[number], own[nearest], one.points[ray, 0]))
+    normals, offsets = sources.planes.normals.clone(), sources.planes.offsets.clone()
+    for plane, rows in matches.items():
+        if len(rows) >= 3:
+            receivers, bearings, points = (torch.stack(part).double() for part in zip(*rows, strict=True))
+            start = (normals[plane].double(), offsets[plane].double())
+            normal, offset = _moved(start, sources.tx.double(), receivers, bearings, points.mean(0), config)
+            normals[plane], offsets[plane] = normal.float(), offset.float()
+    return Planes(normals, offsets)
+
+
+def _moved(
+    plane: tuple[Tensor, Tensor], tx: Tensor, receivers: Tensor, bearings: Tensor, centre: Tensor, config: SourceConfig
+) -> tuple[Tensor, Tensor]:
+    """Normal and offset after Gauss and Newton's steps on the bearings of the image, robust against strangers."""
+    normal, offset = plane
+    lean = torch.linalg.cross(normal, torch.eye(3, dtype=normal.dtype)[normal.abs().argmin()])
+    lean = lean / torch.linalg.vector_norm(lean)
+    axes = torch.stack((lean, torch.linalg.cross(normal, lean)))
+    away = normal @ centre - offset
+    turn = math.radians(config.plane_error_deg)
+    spread = torch.tensor([turn, turn, config.plane_error], dtype=normal.dtype)
+
+    def placed(shift: Tensor) -> tuple[Tensor, Tensor]:
+        turned = torch.nn.functional.normalize(normal + shift[:2] @ axes, dim=-1)
+        return turned, turned @ centre - away + shift[2]
+
+    def bearings_of(shift: Tensor) -> Tensor:
+        turned, moved = placed(shift)
+        return torch.nn.functional.normalize(mirrored(tx, turned, moved) - receivers, dim=-1)
+
+    shift = torch.zeros(3, dtype=normal.dtype)
+    for _ in range(STEPS):
+        here = bearings_of(shift)
+        miss = bearings - here
+        step = 1e-4
+        slope = torch.stack([(bearings_of(shift + step * one) - here) / step for one in torch.eye(3).double()], -1)
+        size = torch.linalg.vector_norm(miss, dim=-1)
+        weight = (BEARING / size.clamp_min(BEARING)) ** 2 / BEARING**2
+        left = torch.einsum("nik,n,nij->kj", slope, weight, slope) + torch.diag(1 / spread**2)
+        right = torch.einsum("nik,n,ni->k", slope, weight, miss) - shift / spread**2
+        shift = shift + torch.linalg.solve(left, right)
+    return placed(shift)
+
+
+@dataclass(frozen=True, eq=False)
+class Mirror:
+    """A plane that peaks imply: normal `[3]`, offset [m], where it was seen to reflect `[n, 3]` [m]."""
+
+    normal: Tensor
+    offset: Tensor
+    points: Tensor
+
+
+def find_mirrors(
+    sources: PointSources, rays: list[Rays], peaks: Peaks, spectra: Spectrum, obstacles: Obstacles
+) -> list[Mirror]:
+    """Mirrors implied by points in which bearings of peaks meet that no known source explains.
+
+    A point counts where a tenth of the positions, and five at least, see a peak in it. Points on a surface that is in
+    sight are bright spots and not images.
+    """
+    positions = spectra.pose.position
+    limit = max(0.5 * spectra.instrument.lobe, pixel_of(spectra))
+    free = torch.ones(len(peaks.position), dtype=torch.bool)
+    for number, one in enumerate(rays):
+        own = torch.nonzero(peaks.position == number).squeeze(-1)
+        if len(own) and len(one):
+            near = angle_between(peaks.bearing[own][:, None], one.arrival[None]).amin(-1)
+            free[own] = near > 1.5 * spectra.instrument.lobe
+    rest, mirrors = peaks.only(free), []
+    least = max(LEAST_SUPPORT, math.ceil(LEAST_SHARE * len(spectra)))
+    for _ in range(MOST_FOUND):
+        if len(rest.position) < least:
+            break
+        origin, bearing = positions[rest.position].double(), rest.bearing.double()
+        image, chosen = _meeting(origin, bearing, rest.position, limit)
+        if len(rest.position[chosen].unique()) < least:
+            break
+        mirror = _implied(image.float(), sources.tx, positions[rest.position[chosen]], obstacles)
+        if mirror is not None:
+            mirrors.append(mirror)
+        rest = rest.only(~chosen)
+    return mirrors
+
+
+def _meeting(origin: Tensor, bearing: Tensor, position: Tensor, limit: float) -> tuple[Tensor, Tensor]:
+    """The point `[3]` in which bearings of most positions meet, and which bearings do `[n]`."""
+    candidates = pairwise_meetings(origin, bearing)
+    best, most = candidates[0], -1
+    for chunk in candidates.split(2048):
+        inlier = bearing_error(chunk[:, None], origin, bearing) < limit
+        votes = torch.zeros(len(chunk), int(position.max()) + 1, dtype=torch.bool)
+        for number in position.unique().tolist():
+            votes[:, number] = inlier[:, position == number].any(-1)
+        count = votes.sum(-1)
+        if int(count.max()) > most:
+            best, most = chunk[int(count.argmax())], int(count.max())
+    for _ in range(10):
+        chosen = bearing_error(best[None], origin, bearing) < limit
+        if int(chosen.sum()) < 3:
+            break
+        best = closest_point(origin[chosen], bearing[chosen], best)
+    return best, bearing_error(best[None], origin, bearing) < limit
+
+
+def _implied(image: Tensor, tx: Tensor, receivers: Tensor, obstacles: Obstacles) -> Mirror | None:
+    """The bisector of transmitter and image, or None where the point is the transmitter or a spot on a surface."""
+    link = image - tx
+    length = torch.linalg.vector_norm(link)
+    if float(length) < NEAREST_IMAGE:
+        return None
+    normal = -link / length
+    offset = normal @ (0.5 * (image + tx))
+    height = receivers @ normal - offset
+    if float((height > 0).double().mean()) < 0.8:
+        return None
+    towards = torch.nn.functional.normalize(image - receivers, dim=-1)
+    short, beyond = image - SPOT * towards, image + SPOT * towards
+    in_sight = obstacles.transmittance(receivers, short) > 0.5
+    hit = obstacles.transmittance(short, beyond, stop_short=0.0) < 0.5
+    if float((in_sight & hit).double().mean()) > 0.3:
+        return None
+    good = height > 0
+    share = height[good] / (height[good] + (tx @ normal - offset))
+    points = receivers[good] + share[:, None] * (image - receivers[good])
+    return Mirror(normal, offset, points)
+
+
+def with_mirrors(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, Patches, int]:
+    """Planes and patches completed by mirrors, and how many planes are new.
+
+    A mirror that lies in a known plane gives it surface where it was seen to reflect; any other is a new plane.
+    """
+    assert sources.patches is not None
+    normals, offsets = list(sources.planes.normals), list(sources.planes.offsets)
+    points = [surface_points(sources.planes, sources.patches, plane) for plane in range(len(sources.planes))]
+    known = len(points)
+    for mirror in mirrors:
+        middle = mirror.points.mean(0)
+        for plane, (normal, offset) in enumerate(zip(normals, offsets, strict=True)):
+            same = abs(float(normal @ mirror.normal)) > SAME_ANGLE
+            if same and abs(float(normal @ middle - offset)) < SAME_DISTANCE:
+                place = plane
+                break
+        else:
+            place = len(points)
+            normals.append(mirror.normal)
+            offsets.append(mirror.offset)
+            points.append(torch.zeros(0, 3))
+        points[place] = torch.cat((points[place], _discs(mirror)))
+    planes = Planes(torch.stack(normals), torch.stack(offsets))
+    return planes, Patches.of(planes, points), len(points) - known
+
+
+def surface_points(planes: Planes, patches: Patches, plane: int) -> Tensor:
+    """The middles `[n, 3]` [m] of the cells of one plane that are surface."""
+    cell = torch.nonzero(patches.grid(plane))
+    local = patches.low[plane] + (cell + 0.5) * CELL
+    return local @ patches.axes[plane] + planes.offsets[plane] * planes.normals[plane]
+
+
+def _discs(mirror: Mirror) -> Tensor:
+    """Points `[n, 3]` all over discs of surface around where a mirror was seen to reflect."""
+    lean = torch.linalg.cross(mirror.normal, torch.eye(3)[mirror.normal.abs().argmin()])
+    lean = lean / torch.linalg.vector_norm(lean)
+    axes = torch.stack((lean, torch.linalg.cross(mirror.normal, lean)))
+    steps = torch.arange(-DISC, DISC + 1.0)
+    spots = torch.cartesian_prod(steps, steps)
+    spots = spots[spots.norm(dim=-1) <= DISC + 0.5] * CELL
+    return (mirror.points[:, None] + spots @ axes).reshape(-1, 3)
+
+
+def completed(sources: PointSources, planes: Planes, patches: Patches) -> PointSources:
+    """The sources over other planes: reflections of new planes are those of the mean plane; images are left out."""
+    new = len(planes) - len(sources.planes)
+    mean = sources.reflection.mean(0, keepdim=True) if len(sources.reflection) else torch.zeros(1, 3)
+    reflection = torch.cat((sources.reflection, mean.expand(new, 3)))
+    return replace(sources, planes=planes, patches=patches, reflection=reflection, sequence=sources.sequence[:1])

@@ -1,0 +1,91 @@
+import math
+
+import pytest
+import torch
+
+from rf3dgs.core.errors import InputError
+from rf3dgs.geometry import SurfaceConfig, Surfaces, find_surfaces
+from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.splats.surface import sample_mesh
+
+
+def box(low: tuple[float, ...], high: tuple[float, ...], *, inwards: bool = False) -> tuple[torch.Tensor, torch.Tensor]:
+    corners = torch.cartesian_prod(*(torch.tensor(pair) for pair in zip(low, high, strict=True)))
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = torch.tensor([(q[0], *pair) for q in quads for pair in ((q[1], q[2]), (q[2], q[3]))])
+    return corners, faces.flip(1) if inwards else faces
+
+
+def room(count: int = 6000, seed: int = 0) -> Gaussians:
+    """A room of 5 x 4 x 3 m with a block of 1 x 1 x 0.8 m in its middle."""
+    shell = sample_mesh(*box((0.0, 0.0, 0.0), (5.0, 4.0, 3.0), inwards=True), count=count, seed=seed)
+    block = sample_mesh(*box((2.0, 1.5, 0.0), (3.0, 2.5, 0.8)), spacing=0.1, seed=seed)
+    return Gaussians.join((shell, block))
+
+
+EYES = torch.tensor([[1.0, 1.0, 1.5], [4.0, 1.0, 1.6], [1.0, 3.0, 1.4], [4.0, 3.0, 1.5]])
+
+
+@pytest.fixture(scope="module")
+def found() -> Surfaces:
+    return find_surfaces(room(), EYES)
+
+
+def test_every_wall_of_a_room_is_found_where_it_is(found: Surfaces) -> None:
+    walls = torch.tensor([[1.0, 0, 0, 0], [-1, 0, 0, -5], [0, 1, 0, 0], [0, -1, 0, -4], [0, 0, 1, 0], [0, 0, -1, -3]])
+    planes = torch.cat((found.planes.normals, found.planes.offsets[:, None]), -1)
+    nearest = torch.minimum(
+        (planes[:, None] - walls).abs().amax(-1).amin(0), (planes[:, None] + walls).abs().amax(-1).amin(0)
+    )
+    assert float(nearest.max()) < 2e-3  # the lattice lies exactly on the faces; the fit is over thousands of points
+
+
+def test_each_gaussian_is_in_one_segment_and_on_one_plane_at_most(found: Surfaces) -> None:
+    assert len(found.segment_of) == len(found.plane_of) == len(room())
+    assert sorted(set(found.segment_of.tolist())) == list(range(found.segments))
+    assert int(found.plane_of.max()) == len(found.planes) - 1
+    for segment in range(found.segments):
+        assert len(set(found.plane_of[found.segment_of == segment].tolist()) - {-1}) <= 1
+
+
+def test_normals_are_unit_and_face_the_viewpoints(found: Surfaces) -> None:
+    means = room().means
+    assert torch.allclose(torch.linalg.vector_norm(found.normals, dim=-1), torch.ones(len(means)), atol=1e-5)
+    shell = (means[:, 2] > 1e-3) & ((means[:, 0] < 1e-3) | (means[:, 0] > 5 - 1e-3))
+    inwards = (torch.tensor([2.5, 2.0, 1.5]) - means) * found.normals
+    assert bool((inwards.sum(-1)[shell] > 0).float().mean() > 0.99)
+
+
+def test_the_same_seed_finds_the_same_surfaces(found: Surfaces) -> None:
+    again = find_surfaces(room(), EYES)
+    for name, tensor in found.tensors().items():
+        assert torch.equal(tensor, again.tensors()[name]), name
+
+
+def test_surfaces_survive_their_tensors(found: Surfaces) -> None:
+    back = Surfaces.from_tensors(found.tensors())
+    assert torch.equal(back.patches.cells, found.patches.cells)
+    assert torch.equal(back.segment_of, found.segment_of)
+
+
+def test_a_patch_holds_its_wall_and_nothing_beside_it(found: Surfaces) -> None:
+    floor = int((found.planes.normals[:, 2].abs() - found.planes.offsets.abs()).argmax())
+    points = torch.tensor([[1.0, 1.0, 0.0], [4.9, 3.9, 0.5], [5.4, 1.0, 0.0], [1.0, -0.4, 0.0]])
+    assert found.patches.holds(points, torch.tensor([floor] * 4)).tolist() == [True, True, False, False]
+    assert not bool(found.patches.holds(points, torch.tensor([-1] * 4)).any())
+    assert math.isclose(float(found.patches.areas[floor]), 19.0, rel_tol=0.15)  # 20 m^2 less the block's foot
+
+
+def test_a_cloud_without_planes_has_segments_only() -> None:
+    cloud = Gaussians.random(300, (0, 0, 0), (5, 5, 5), seed=1)
+    found = find_surfaces(cloud, EYES)
+    assert len(found.planes) == 0
+    assert bool((found.plane_of == -1).all())
+    assert not bool(found.patches.holds(torch.zeros(2, 3), torch.tensor([0, -1])).any())
+
+
+def test_viewpoints_that_are_no_points_are_refused() -> None:
+    with pytest.raises(InputError, match=r"viewpoints must be \[view, 3\]"):
+        find_surfaces(room(600), torch.zeros(4, 2))
+    with pytest.raises(InputError, match="viewpoints must be finite"):
+        find_surfaces(room(600), torch.tensor([[math.nan, 0.0, 0.0]]), SurfaceConfig())
