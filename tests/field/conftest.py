@@ -13,7 +13,7 @@ from rf3dgs.core.grids import DirectionGrid, equirect_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.field.radiance import Surface
 from rf3dgs.field.radio_field import RadioField
-from rf3dgs.field.sources import PointSource
+from rf3dgs.field.sources import PointSources
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.gaussians import Gaussians
@@ -88,7 +88,7 @@ def field(room: Room) -> RadioField:
     )
     return RadioField(
         surface=surface,
-        sources=(PointSource(room.tx, room.tx),),
+        sources=PointSources.line_of_sight(room.tx, FREQUENCY),
         solidity=room.geometry.opacities,
         frequency=FREQUENCY,
         instrument=room.instrument,

@@ -86,7 +86,7 @@ def change(saved, edit):
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda body: body.update(schema=99), "expected a field of schema 1; got 99"),
+        (lambda body: body.update(schema=99), "expected a field of schema 1 or 2; got 99"),
         (lambda body: body.pop("window_db"), "window_db"),
         (lambda body: body.update(gaussians=7), "must be"),
         (lambda body: body.update(encoding="polar"), "polar"),

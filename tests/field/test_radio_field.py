@@ -25,7 +25,7 @@ def turned(field, yaw):
     matrix = Pose([0.0, 0.0, 0.0], spin).world_from_device
     tx = field.tx.position @ matrix.mT
     surface = replace(field.surface, means=field.surface.means @ matrix.mT, quats=quats, tx=tx)
-    sources = tuple(replace(one, position=one.position @ matrix.mT, tx=tx) for one in field.sources)
+    sources = replace(field.sources, tx=tx)
     return replace(field, surface=surface, sources=sources, tx=field.tx.turned(yaw))
 
 
@@ -69,7 +69,8 @@ def test_power_of_parts_adds_linearly(field, sphere):
     whole = field.render(HERE, sphere).power
     parts = field.without_sources().render(HERE, sphere).power + sources_only.render(HERE, sphere).power
     torch.testing.assert_close(whole, parts)
-    twice = replace(field, sources=field.sources * 2).render(HERE, sphere).power
+    louder = replace(field.sources, level_db=10 * math.log10(2))
+    twice = replace(field, sources=louder).render(HERE, sphere).power
     torch.testing.assert_close(twice - whole, sources_only.render(HERE, sphere).power, atol=1e-16, rtol=1e-3)
 
 
@@ -157,6 +158,17 @@ def test_paths_are_sorted_and_peaks_of_the_surface_have_their_own_delay(field, r
     assert bool((paths.delay[rest] > straight - 2e-9).all())
 
 
+def test_sources_alone_are_asked_without_a_search_for_peaks(field):
+    paths = field.paths(HERE, strongest=5, parts="sources")
+    assert paths.valid.tolist() == [True, False, False, False, False]
+    assert paths.kind.tolist()[0] == 0
+    everything = field.paths(HERE, strongest=5)
+    assert everything.valid.all()
+    assert sorted(everything.kind.tolist()) == [0, 2, 2, 2, 2]
+    first = int((everything.kind == 0).nonzero()[0])
+    assert torch.equal(paths.coeff[0], everything.coeff[first])
+
+
 def test_a_channel_comes_out_of_the_paths(field):
     from rf3dgs.channel.arrays import ofdm, planar_array
 
@@ -175,6 +187,8 @@ def test_the_field_marks_receivers_outside_its_training(field):
 def test_errors_say_what_to_do(field):
     with pytest.raises(InputError, match="strongest must be at least 1; got 0"):
         field.paths(HERE, strongest=0)
+    with pytest.raises(InputError, match='parts must be "all" or "sources"; got "mirrors"'):
+        field.paths(HERE, parts="mirrors")
     with pytest.raises(InputError, match="paths needs at least one pose; got an empty batch"):
         field.paths(Pose(torch.zeros(0, 3)))
     with pytest.raises(InputError, match="at least one pose"):

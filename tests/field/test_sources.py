@@ -9,9 +9,11 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid
 from rf3dgs.core.units import friis_gain
-from rf3dgs.field.sources import PointSource, estimate_transmitter, fit_line_of_sight, fit_opening
+from rf3dgs.field.sources import PointSources
+from rf3dgs.field.transmitter import estimate_transmitter
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.obstacles import Obstacles
+from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
 
 
 def cluttered(count: int, *, blocked: int, seed: int, degrees: float = 2.0, lobe: float = 3.0) -> tuple[Spectrum, Pose]:
@@ -47,9 +49,10 @@ def test_a_found_transmitter_keeps_the_line_of_sight():
     spectra, tx = cluttered(24, blocked=5, seed=4)
     found = estimate_transmitter(spectra).position
     here = torch.tensor([10.0, 8.0, 1.5])
-    exact, estimated = PointSource(tx.position, tx.position), PointSource(found, found)
-    assert abs(float(exact.delay(here) - estimated.delay(here))) < 1e-10
-    assert float(angle_between(exact.arrival(here), estimated.arrival(here))) < math.radians(0.5)
+    free = Obstacles(torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0))
+    exact, estimated = (PointSources.line_of_sight(place, 60e9).rays(here, free) for place in (tx.position, found))
+    assert abs(float(exact.delay - estimated.delay)) < 1e-10
+    assert float(angle_between(exact.arrival, estimated.arrival)) < math.radians(0.5)
 
 
 def test_bearings_that_do_not_meet_are_refused():
@@ -63,36 +66,35 @@ def test_bearings_that_do_not_meet_are_refused():
 def test_the_level_of_the_line_of_sight_is_fitted_where_it_is_seen():
     spectra, tx = cluttered(20, blocked=6, seed=2)
     louder = replace(spectra, power=spectra.power * 10 ** (0.7))
-    source, seen = fit_line_of_sight(PointSource(tx.position, tx.position), louder)
+    sources, seen = fit_line_of_sight(PointSources.line_of_sight(tx.position, 60e9), louder)
     assert seen.tolist() == [False] * 6 + [True] * 14
-    assert abs(source.gain_db - 7.0) < 0.3
+    assert abs(sources.level_db - 7.0) < 0.3
 
 
 def test_a_source_that_nobody_sees_keeps_its_level():
     spectra, _ = cluttered(8, blocked=0, seed=2)
-    elsewhere = torch.tensor([-20.0, 4.0, 9.0])
-    source, seen = fit_line_of_sight(
-        PointSource(elsewhere, elsewhere, gain_db=1.5), replace(spectra, power=torch.ones_like(spectra.power))
-    )
-    assert source.gain_db == 1.5
+    sources = PointSources.line_of_sight(torch.tensor([-20.0, 4.0, 9.0]), 60e9, level_db=1.5)
+    sources, seen = fit_line_of_sight(sources, replace(spectra, power=torch.ones_like(spectra.power)))
+    assert sources.level_db == 1.5
     assert not bool(seen.any())
 
 
 def test_a_wall_hides_a_source_and_the_threshold_follows_what_was_seen(wall):
     obstacles = Obstacles(wall.means, wall.quats, wall.scales, wall.opacities)
-    source = PointSource(torch.tensor([1.0, 1.0, 2.0]), torch.tensor([1.0, 1.0, 2.0]))
+    sources = PointSources.line_of_sight(torch.tensor([1.0, 1.0, 2.0]), 60e9)
     receivers = torch.tensor([[2.0, 3.0, 1.0], [5.0, 3.0, 1.0], [4.0, 1.0, 1.5]])
-    assert source.visible(receivers, obstacles).tolist() == [True, False, False]
+    assert sources.sees(receivers, obstacles).tolist() == [True, False, False]
     haze = replace(obstacles, opacities=torch.full_like(obstacles.opacities, 0.35))
-    passed = source.transmittance(receivers, haze)
+    passed = haze.transmittance(sources.tx.expand(3, 3), receivers)
     assert 0.01 < float(passed[1]) < 0.9
-    fitted = fit_opening(source, torch.tensor([True, True, True]), receivers, haze)
-    assert bool(fitted.visible(receivers, haze).all())
+    fitted = fit_opening(sources, torch.tensor([True, True, True]), receivers, haze)
+    assert bool(fitted.sees(receivers, haze).all())
 
 
 def test_a_beam_is_one_at_its_centre_and_half_at_half_a_lobe():
-    source = PointSource(torch.tensor([5.0, 0.0, 0.0]), torch.tensor([5.0, 0.0, 0.0]))
+    free = Obstacles(torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0))
+    rays = PointSources.line_of_sight(torch.tensor([5.0, 0.0, 0.0]), 60e9).rays(torch.zeros(3), free)
     half = math.radians(1.5)
-    directions = torch.tensor([[1.0, 0.0, 0.0], [math.cos(half), math.sin(half), 0.0]])
-    beam = source.beam(directions, torch.zeros(3), Instrument.gaussian(math.radians(3)))
-    torch.testing.assert_close(beam, torch.tensor([1.0, 0.5]), atol=1e-5, rtol=0)
+    directions = torch.tensor([[1.0, 0.0, 0.0], [math.cos(half), math.sin(half), 0.0], [-1.0, 0.0, 0.0]])
+    beam = rays.picture(directions, Instrument.gaussian(math.radians(3))) / rays.power
+    torch.testing.assert_close(beam, torch.tensor([1.0, 0.5, 0.0]), atol=1e-4, rtol=0)

@@ -125,7 +125,7 @@ def test_delay_and_departure_follow_the_truth(trained, held_out):
 def test_the_paper_s_own_encoding_learns_the_level(training, held_out):
     config = replace(RadioConfig.paper(steps=150), lr_level=2e-2, lr_csi=2e-2, backend="reference")
     field = fit_radio(room(), training, config)
-    assert field.sources == ()
+    assert field.sources is None
     assert field.surface.csi_sh.shape[1:] == (16, 3)
     assert level_error(field, held_out) < 5.0
     rendered = field.render(held_out.pose, held_out.grid)
@@ -149,9 +149,9 @@ def test_pinhole_spectra_train_directly(training):
 
 
 def test_point_sources_are_masked_out_of_the_surface(training, trained):
-    source = trained.sources[0]
     seen = torch.ones(len(training), dtype=torch.bool)
-    views = radio_views(training, trained.surface.window, sources=[(source, seen)])
+    rays = trained.sources.rays_each(training.pose.position, trained.obstacles, in_sight=seen)
+    views = radio_views(training, trained.surface.window, rays=rays)
     assert len(views) == len(training)
     area = training.grid.solid_angle / training.grid.solid_angle.mean()
     for one in views:

@@ -80,7 +80,7 @@ def _field_facts(path: str | Path) -> dict[str, str]:
     facts = {
         "kind": "radio radiance field",
         "Gaussians": f"{len(field.surface):,}",
-        "point sources": str(len(field.sources)),
+        "point sources": "0" if field.sources is None else str(len(field.sources)),
         "frequency": f"{field.frequency / 1e9:g} GHz",
         "transmitter": "(" + ", ".join(f"{value:.2f}" for value in field.tx.position.tolist()) + f") m{how}",
         "dB window": f"{field.window.floor_db:.1f} to {field.window.ceil_db:.1f} dB",

@@ -7,16 +7,16 @@ from rf3dgs.core.lazy import lazy_names
 if TYPE_CHECKING:
     from rf3dgs.field.radiance import Surface as Surface
     from rf3dgs.field.radio_field import RadioField as RadioField
-    from rf3dgs.field.sources import PointSource as PointSource
-    from rf3dgs.field.sources import estimate_transmitter as estimate_transmitter
+    from rf3dgs.field.sources import PointSources as PointSources
+    from rf3dgs.field.sources import Rays as Rays
+    from rf3dgs.field.transmitter import estimate_transmitter as estimate_transmitter
 
-__all__ = ["PointSource", "RadioField", "Surface", "estimate_transmitter"]
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "RadioField": ".radio_field",
-        "Surface": ".radiance",
-        "PointSource": ".sources",
-        "estimate_transmitter": ".sources",
-    },
-)
+_HOMES = {
+    "RadioField": ".radio_field",
+    "Surface": ".radiance",
+    "PointSources": ".sources",
+    "Rays": ".sources",
+    "estimate_transmitter": ".transmitter",
+}
+__all__ = ["RadioField", "Surface", "PointSources", "Rays", "estimate_transmitter"]  # noqa: RUF022 (reading order)
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -34,7 +34,7 @@ class Folded:
 
 
 def mirrored(points: Tensor, normals: Tensor, offsets: Tensor) -> Tensor:
-    """Mirror images `[*batch, 3]` of points `[*batch, 3]` in the planes normal . x = offset, `[*batch, 3]` and `[*batch]`."""
+    """Images `[*batch, 3]` of points `[*batch, 3]` in planes of `normals` `[*batch, 3]` and `offsets` `[*batch]`."""
     return points - 2.0 * ((points * normals).sum(-1) - offsets)[..., None] * normals
 
 

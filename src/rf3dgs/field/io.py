@@ -25,11 +25,12 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.data.safe import read_bytes, read_json
 from rf3dgs.field.radiance import CSI_CHANNELS, CSI_DEGREE, Surface
 from rf3dgs.field.radio_field import RadioField
-from rf3dgs.field.sources import PointSource
+from rf3dgs.field.source_files import source_record, source_tensors, sources_of
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Instrument
 
-SCHEMA = 1
+SCHEMA = 2
+READABLE = (1, 2)
 DESCRIPTION, TENSORS = "field.json", "tensors.safetensors"
 MAX_TENSOR_BYTES = 4 * 2**30
 CONVENTIONS = {
@@ -74,8 +75,8 @@ def load_field(path: str | Path) -> RadioField:
     body = record.get("body")
     if not isinstance(body, dict) or record.get("sha256") != _digest(body):
         raise DataError(f"{source}: does not match its checksum; copy or train the field again")
-    if body.get("schema") != SCHEMA:
-        raise DataError(f"{source}: expected a field of schema {SCHEMA}; got {body.get('schema')!r}. Train it again")
+    if body.get("schema") not in READABLE:
+        raise DataError(f"{source}: expected a field of schema 1 or 2; got {body.get('schema')!r}. Train it again")
     try:
         expected = body["tensors"]
         data = read_bytes(folder / TENSORS, limit=min(MAX_TENSOR_BYTES, int(expected["bytes"])))
@@ -84,8 +85,10 @@ def load_field(path: str | Path) -> RadioField:
         tensors = tensors_of_bytes(data)
         _check(tensors, body, folder / TENSORS)
         return _assemble(tensors, body)
-    except DataError:
-        raise
+    except DataError as error:
+        if str(folder) in str(error) or str(error).startswith(DESCRIPTION):
+            raise
+        raise DataError(f"{folder / TENSORS}: {error}; train the field again") from error
     except (KeyError, TypeError, ValueError, OverflowError, RfError, SafetensorError) as error:
         raise DataError(f"{source}: is not a field this version can read ({error!r}); train it again") from error
 
@@ -103,7 +106,9 @@ def _tensors(field: RadioField) -> dict[str, Tensor]:
     stored["means"] = surface.means.detach().contiguous()
     stored["solidity"] = (field.solidity.detach().clamp(0, 1) * 255).round().to(torch.uint8)
     stored["colour"] = field.colour.to(torch.uint8).contiguous()
-    return stored
+    if field.plane_of is not None:
+        stored["plane_of"] = field.plane_of.to(torch.int16).contiguous()
+    return stored | source_tensors(field.sources)
 
 
 def _description(field: RadioField) -> dict[str, Any]:
@@ -126,15 +131,8 @@ def _description(field: RadioField) -> dict[str, Any]:
         "tx": {"position": field.tx.position.tolist(), "orientation": field.tx.orientation.tolist()},
         "prior_tx": surface.tx.tolist(),
         "bounds": field.bounds.tolist(),
-        "sources": [
-            {
-                "position": source.position.tolist(),
-                "tx": source.tx.tolist(),
-                "gain_db": source.gain_db,
-                "open_above": source.open_above,
-            }
-            for source in field.sources
-        ],
+        "sources": source_record(field.sources),
+        "labelled": field.plane_of is not None,
         "versions": {"torch": torch.__version__, "python": sys.version.split()[0]},
         "meta": field.meta,
     }
@@ -153,6 +151,8 @@ def _check(tensors: Mapping[str, Tensor], body: Mapping[str, Any], source: Path)
         "solidity": ((count,), torch.uint8),
         "colour": ((count, 3), torch.uint8),
     }
+    if body.get("labelled", False):
+        expected["plane_of"] = ((count,), torch.int16)
     for name, (shape, kind) in expected.items():
         if name not in tensors:
             raise DataError(f"{source}: lacks the tensor {name}; train the field again")
@@ -180,22 +180,14 @@ def _assemble(tensors: Mapping[str, Tensor], body: Mapping[str, Any]) -> RadioFi
         encoding=body["encoding"],
         delay_span=_number(body["delay_span"], "delay_span"),
     )
-    sources = tuple(
-        PointSource(
-            _vector(one["position"], "source position"),
-            _vector(one["tx"], "source tx"),
-            _number(one["gain_db"], "gain_db"),
-            _number(one["open_above"], "open_above"),
-        )
-        for one in body["sources"]
-    )
+    frequency = _number(body["frequency"], "frequency")
     instrument = body["instrument"]
     low, high = (_vector(corner, "bounds") for corner in body["bounds"])
     return RadioField(
         surface=surface,
-        sources=sources,
+        sources=sources_of(body["sources"], tensors, frequency),
         solidity=tensors["solidity"].float() / 255,
-        frequency=_number(body["frequency"], "frequency"),
+        frequency=frequency,
         instrument=Instrument(
             str(instrument["name"]),
             _number(instrument["lobe"], "lobe"),
@@ -205,6 +197,7 @@ def _assemble(tensors: Mapping[str, Tensor], body: Mapping[str, Any]) -> RadioFi
         bounds=torch.stack((low, high)),
         colour=tensors["colour"],
         meta=dict(body["meta"]),
+        plane_of=tensors["plane_of"].long() if body.get("labelled", False) else None,
     )
 
 

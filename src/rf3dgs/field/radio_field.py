@@ -108,7 +108,7 @@ class RadioField:
         if strongest < 1:
             raise InputError(f"strongest must be at least 1; got {strongest}")
         if parts not in ("all", "sources"):
-            raise InputError(f'parts must be "all" or "sources"; got {parts!r}')
+            raise InputError(f'parts must be "all" or "sources"; got "{parts}"')
         flat = pose.flat()
         if len(flat) == 0:
             raise InputError("paths needs at least one pose; got an empty batch")
@@ -172,7 +172,7 @@ class RadioField:
             table = torch.cat((head, rays.arrival, rays.departure, numbers), -1)
             table = table[table[:, 0].argsort(descending=True, stable=True)][:strongest]
         if with_peaks and len(table) < strongest:
-            table = torch.cat((table, self._peaks(pose, strongest - len(table))))
+            table = torch.cat((table, self._peaks(pose, strongest)[: strongest - len(table)]))
             table = table[table[:, 0].argsort(descending=True, stable=True)]
         return torch.cat((table, torch.zeros(strongest - len(table), 10)))
 

@@ -17,9 +17,11 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.field.images import HIGHEST_ORDER, Folded, fold, image_chain
 from rf3dgs.geometry import Patches, Planes
+from rf3dgs.geometry.patches import CELL
 from rf3dgs.spectra.spectrum import Instrument
 from rf3dgs.splats.obstacles import Obstacles
 
+MARK_PRIOR = 0.05  # weight of no deviation beside marks of weight 1 where they are
 FARTHEST_LOBES = 6.2  # where a lobe's kernel is zero in float32
 
 
@@ -67,6 +69,30 @@ class Rays:
 
 
 @dataclass(frozen=True, eq=False)
+class Marks:
+    """Places on planes where the reflection was measured to be other than the plane's: doors and windows in walls.
+
+    points `[M, 3]` [m], plane `[M]`, level_db `[M]`: what is added to 10 log10 Gamma. width [m]: how far one reaches.
+    """
+
+    points: Tensor
+    plane: Tensor
+    level_db: Tensor
+    width: float
+
+    def at(self, points: Tensor, plane: Tensor, *, leave_out: bool = False) -> Tensor:
+        """What is added at points `[n, 3]` of planes `[n]` [dB]: the mean of near marks, drawn to 0 where few are.
+
+        With `leave_out` the points are those of the marks, and each is told by the others alone.
+        """
+        square = (points[:, None] - self.points).square().sum(-1)
+        weight = torch.exp(-0.5 * square / self.width**2) * (plane[:, None] == self.plane)
+        if leave_out:
+            weight.fill_diagonal_(0.0)
+        return (weight @ self.level_db) / (weight.sum(-1) + MARK_PRIOR)
+
+
+@dataclass(frozen=True, eq=False)
 class PointSources:
     """The transmitter and its images in planes, all point sources of a field.
 
@@ -74,7 +100,8 @@ class PointSources:
     of the line of sight and of all images. planes: P planes; patches: where they have surface, or None for everywhere.
     reflection `[P, 3]`: a, b and c of 10 log10 Gamma = a + b cos + c cos^2 at the angle of incidence, at most 0 dB.
     sequence `[K, 3]`: the planes of each source in the order from the transmitter, -1 beyond the last; the first row is
-    the line of sight, all -1. open_above: the transmittance of a way above which it is open.
+    the line of sight, all -1. open_above: the transmittance of a way above which it is open. marks: where planes
+    reflect otherwise, or None.
     """
 
     tx: Tensor
@@ -85,6 +112,7 @@ class PointSources:
     reflection: Tensor
     level_db: float = 0.0
     open_above: float = 0.1
+    marks: Marks | None = None
 
     def __post_init__(self) -> None:
         count = len(self.planes)
@@ -128,29 +156,42 @@ class PointSources:
         """Number of reflections `[K]`."""
         return (self.sequence >= 0).sum(-1)
 
+    @cached_property
+    def reach(self) -> Patches | None:
+        """The patches with every cell beside an occupied one filled too, so that one look-up asks `Patches.holds`."""
+        return None if self.patches is None else widened(self.patches)
+
     def folded(self, receivers: Tensor) -> tuple[Folded, Tensor]:
         """The broken lines to receivers `[*batch, 3]`, and where all their points lie on surface `[*batch, K]`."""
         lines = fold(self.chain, self.planes.normals, self.planes.offsets, self.sequence, receivers)
         good = lines.possible
-        if self.patches is not None:
+        if self.reach is not None:
             for step in range(int(self.order.max())):
                 plane = self.sequence[:, step].expand(good.shape)
                 asked = torch.nonzero(good & (plane >= 0), as_tuple=True)
-                good[asked] = self.patches.holds(lines.points[..., step, :][asked], plane[asked])
+                where = plane[asked]
+                cell = self.reach.cell_of(lines.points[..., step, :][asked], where)
+                good[asked] = self.reach.occupied(where, cell)
         return lines, good
 
-    def gain(self, source: Tensor, distance: Tensor, cosine: Tensor) -> Tensor:
-        """Path gain `[n]`, linear, of open ways of `distance` `[n]` [m] over reflections at `cosine` `[n, 3]`."""
-        level_db = self.level_db + self.reflection_db(source, cosine).sum(-1)
+    def gain(self, source: Tensor, distance: Tensor, cosine: Tensor, points: Tensor) -> Tensor:
+        """Path gain `[n]`, linear, of open ways of `distance` `[n]` [m].
+
+        They are reflected at `cosine` `[n, 3]` of incidence in `points` `[n, 3, 3]`.
+        """
+        level_db = self.level_db + self.reflection_db(source, cosine, points).sum(-1)
         return friis_gain(distance, self.frequency) * 10.0 ** (level_db / 10.0)
 
-    def reflection_db(self, source: Tensor, cosine: Tensor) -> Tensor:
+    def reflection_db(self, source: Tensor, cosine: Tensor, points: Tensor) -> Tensor:
         """10 log10 Gamma `[n, 3]` of each reflection of sources `[n]`, 0 beyond the last."""
         plane = self.sequence[source]
         if not len(self.planes):
             return torch.zeros_like(cosine)
         a, b, c = self.reflection[plane.clamp_min(0)].unbind(-1)
-        return torch.where(plane >= 0, (a + b * cosine + c * cosine * cosine).clamp_max(0.0), 0.0)
+        level_db = a + b * cosine + c * cosine * cosine
+        if self.marks is not None:
+            level_db = level_db + self.marks.at(points.reshape(-1, 3), plane.reshape(-1)).reshape(plane.shape)
+        return torch.where(plane >= 0, level_db.clamp_max(0.0), 0.0)
 
     def transmittance(self, source: Tensor, points: Tensor, receivers: Tensor, obstacles: Obstacles) -> Tensor:
         """Share `[n]` that passes on the ways from the transmitter over `points` `[n, 3, 3]` to `receivers` `[n, 3]`.
@@ -163,8 +204,13 @@ class PointSources:
         labels = torch.nn.functional.pad(plane, (1, 1), value=-1)
         leg = torch.arange(HIGHEST_ORDER + 1)
         way, step = torch.nonzero(leg <= last[:, None], as_tuple=True)
-        ends = {} if obstacles.labels is None else {"skip_start": labels[way, step], "skip_end": labels[way, step + 1]}
-        passed = obstacles.transmittance(stops[way, step], stops[way, step + 1], **ends)
+        known = obstacles.labels is not None
+        passed = obstacles.transmittance(
+            stops[way, step],
+            stops[way, step + 1],
+            skip_start=labels[way, step] if known else None,
+            skip_end=labels[way, step + 1] if known else None,
+        )
         whole = passed.new_ones(len(source), HIGHEST_ORDER + 1)
         whole[way, step] = passed
         return whole.prod(-1)
@@ -185,7 +231,7 @@ class PointSources:
         distance, cosine = lines.distance[place, source], lines.cosine[place, source]
         rays = Rays(
             source,
-            self.gain(source, distance, cosine),
+            self.gain(source, distance, cosine, points),
             lines.arrival[place, source],
             lines.departure[place, source],
             distance / SPEED_OF_LIGHT,
@@ -201,3 +247,14 @@ class PointSources:
         flat = receivers.reshape(-1, 3)
         passed = obstacles.transmittance(self.tx.expand_as(flat), flat)
         return (passed > self.open_above).reshape(receivers.shape[:-1])
+
+
+def widened(patches: Patches) -> Patches:
+    """Patches with every cell beside an occupied one, corners too, filled."""
+    shape = patches.shape + 2
+    cells = []
+    for plane in range(len(patches)):
+        grid = torch.nn.functional.pad(patches.grid(plane).float(), (2, 2, 2, 2))
+        cells.append(torch.nn.functional.max_pool2d(grid[None, None], 3, stride=1)[0, 0].flatten() > 0)
+    joined = torch.cat(cells) if cells else patches.cells
+    return Patches(patches.axes, patches.low - CELL, shape, joined)

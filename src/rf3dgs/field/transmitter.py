@@ -42,10 +42,12 @@ def estimate_transmitter(spectra: Spectrum, *, tolerance: float | None = None) -
 
 
 def pixel_of(spectra: Spectrum) -> float:
+    """The angle [rad] between the pixels of spectra; 0 for lists of directions."""
     return 0.0 if spectra.grid.kind == "list" else spectra.grid.spacing
 
 
 def bearing_error(point: Tensor, origin: Tensor, bearing: Tensor) -> Tensor:
+    """Angles [rad] by which bearings `[n, 3]` from origins `[n, 3]` miss points `[*batch, 1, 3]`, `[*batch, n]`."""
     towards = point - origin
     return angle_between(towards, bearing.expand_as(towards))
 

@@ -30,6 +30,9 @@ class RadioConfig:
     line_of_sight: Literal["source", "surface"] = "source"
     """"source": the transmitter is a point source of its own, its pixels are masked in the surface's training;
     "surface": the Gaussians must show it too, as in the paper."""
+    mirror_order: int = 0
+    """Most reflections of the mirror images that are point sources beside the transmitter; 0 is the line of sight
+    alone."""
     degree: int = 3
     """Degree of the gain's harmonics."""
     floor_db: float | None = None
@@ -202,9 +205,9 @@ class SourceConfig:
     """Whether mirrors that the geometry lacks are found where secondary peaks of the spectra meet."""
     refine: bool = True
     """Whether planes are moved, within what geometry allows, to where the peaks of their images are."""
-    plane_error: float = 0.03
+    plane_error: float = 0.02
     """How far a plane of the geometry may lie off [m], one standard deviation."""
-    plane_error_deg: float = 1.0
+    plane_error_deg: float = 0.5
     """How far it may be turned [deg], one standard deviation."""
     least_db: float = 40.0
     """Sources that stay so many dB under the strongest part of the spectrum everywhere are left out."""

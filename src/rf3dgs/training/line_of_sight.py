@@ -36,7 +36,7 @@ def standing_out(one: Spectrum, direction: Tensor) -> tuple[float, float]:
 
 
 def fit_line_of_sight(sources: PointSources, spectra: Spectrum) -> tuple[PointSources, Tensor]:
-    """The sources with their level fitted to `spectra` `[position, row, col]`, and who sees the transmitter `[position]`.
+    """The sources with their level fitted to `spectra` `[position, row, col]`, and who sees the transmitter.
 
     A position sees it when what stands out in its direction lies 3 dB over the ring and within 6 dB of the median
     level over Friis of such positions; that median is the fitted level. When nobody sees it the level stays.

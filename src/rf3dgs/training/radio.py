@@ -16,8 +16,8 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.field.radiance import Surface
 from rf3dgs.field.radio_field import RadioField
-from rf3dgs.field.sources import PointSources
 from rf3dgs.field.transmitter import estimate_transmitter
+from rf3dgs.geometry import find_surfaces
 from rf3dgs.spectra.codec import DbWindow, PaperEncoding, window_of
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.detail import level_of_detail
@@ -25,7 +25,7 @@ from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import C0
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.checkpoint import fingerprint
-from rf3dgs.training.config import RadioConfig
+from rf3dgs.training.config import RadioConfig, SourceConfig
 from rf3dgs.training.loop import train
 from rf3dgs.training.mirror import fit_mirror
 from rf3dgs.training.radio_stage import RadioStage
@@ -73,8 +73,12 @@ def fit_radio(
         return fit_mirror(geometry, spectra, config, where, window, _colour(geometry), meta, progress)
     found = None
     if config.line_of_sight == "source":
-        obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, geometry.opacities)
-        found = fit_sources(spectra, None, obstacles, where)
+        with_mirrors = config.mirror_order > 0
+        surfaces = find_surfaces(geometry, spectra.pose.position) if with_mirrors else None
+        labels = None if surfaces is None else surfaces.plane_of
+        obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, geometry.opacities, labels)
+        mirrors = SourceConfig(order=config.mirror_order, seed=config.seed)
+        found = fit_sources(spectra, surfaces, obstacles, where, mirrors)
     span = PaperEncoding.of(spectra).delay_span if config.encoding == "paper" and spectra.delay is not None else 1e-7
     bare = Surface.bare(
         geometry,

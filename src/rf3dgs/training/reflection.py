@@ -1,5 +1,6 @@
 """How much each plane reflects, from how far the images' peaks stand out of their surroundings."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -7,31 +8,39 @@ from torch import Tensor
 
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
-from rf3dgs.field.sources import PointSources, Rays
+from rf3dgs.field.sources import Marks, PointSources, Rays
+from rf3dgs.field.transmitter import pixel_of
 from rf3dgs.spectra.spectrum import Spectrum
-from rf3dgs.training.line_of_sight import standing_out
 
-APART_LOBES = 2.0
+APART_LOBES = 0.9
+LEAST_RING = 8
 HUBER_DB = 1.5
 ROUNDS = 30
 COMMON = (10.0, 10.0, 10.0)  # dB by which a, b and c of one plane may differ from the common ones
 LOOSE = (30.0, 30.0, 30.0)  # and the common ones from DIELECTRIC
 DIELECTRIC = (-6.0, -6.0, 0.0)
-LEAST_DB = -60.0
+WIDTHS = (0.3, 0.5, 0.8)  # of marks [m]
+LEAST_MARKS = 8
+DOUBTFUL_DB = 6.0
+WORTH_DB = 0.2
+MOST_DB = 25.0
+SILENT_SHARE, SILENT_LEAST = 0.3, 3
 
 
 @dataclass(frozen=True, eq=False)
 class Glints:
     """What was measured in the directions of images of order 1: n observations.
 
-    position, source, plane `[n]`: which. cosine `[n]` of incidence. level_db `[n]`: 10 log10 of what stands out over
-    Friis and the sources' level. limit_db `[n]`: the level of the surroundings in the same measure, under which nothing
-    is seen. seen `[n]`: the peak stands 3 dB over its surroundings. alone `[n]`: no other ray arrives beside it.
+    position, source, plane `[n]`: which. point `[n, 3]`: where the reflection is [m]. cosine `[n]` of incidence.
+    level_db `[n]`: 10 log10 of what stands out over Friis and the sources' level. limit_db `[n]`: the level of the
+    surroundings in the same measure. seen `[n]`: the peak stands 3 dB over its surroundings. alone `[n]`: no other ray
+    arrives beside it.
     """
 
     position: Tensor
     source: Tensor
     plane: Tensor
+    point: Tensor
     cosine: Tensor
     level_db: Tensor
     limit_db: Tensor
@@ -44,32 +53,72 @@ class Glints:
 
 def glints(sources: PointSources, rays: list[Rays], spectra: Spectrum) -> Glints:
     """The observations of all rays of order 1 at the positions of `spectra` `[position, row, col]`."""
-    rows = []
+    rows, points = [], [torch.zeros(0, 3)]
     for position, one in enumerate(rays):
+        if not len(one):
+            continue
         spectrum = spectra[position]
-        apart = APART_LOBES * spectrum.instrument.lobe
-        for ray in torch.nonzero(one.order == 1).squeeze(-1).tolist():
-            power, ring = standing_out(spectrum, one.arrival[ray])
-            if not ring == ring:
-                continue
-            friis = float(friis_gain(one.delay[ray] * SPEED_OF_LIGHT, sources.frequency))
-            free = friis * 10 ** (sources.level_db / 10)
-            angle = angle_between(one.arrival, one.arrival[ray].expand_as(one.arrival))
-            angle[ray] = torch.pi
-            near = (angle < apart) & ((one.power > 0.25 * one.power[ray]) | (one.order == 0))
+        power, ring = ray_powers(spectrum, one.arrival)
+        free = friis_gain(one.delay * SPEED_OF_LIGHT, sources.frequency) * 10 ** (sources.level_db / 10)
+        apart = angle_between(one.arrival[:, None], one.arrival[None]) + torch.pi * torch.eye(len(one))
+        crowded = (apart < APART_LOBES * spectrum.instrument.lobe) & (power > 0.25 * power[:, None])
+        for ray in torch.nonzero((one.order == 1) & torch.isfinite(ring)).squeeze(-1).tolist():
             plane = int(sources.sequence[one.index[ray], 0])
             leg = torch.nn.functional.normalize(one.points[ray, 0] - sources.tx, dim=-1)
             cosine = float((leg * sources.planes.normals[plane]).sum().abs())
-            seen = power > ring
-            rows.append((position, int(one.index[ray]), plane, cosine, power / free, ring / free, seen, not near.any()))
+            level, limit = float(power[ray] / free[ray]), float(ring[ray] / free[ray])
+            seen, alone = level > limit, not bool(crowded[ray].any())
+            points.append(one.points[ray, :1])
+            rows.append((position, int(one.index[ray]), plane, cosine, level, limit, seen, alone))
     table = torch.tensor([[float(value) for value in row] for row in rows], dtype=torch.float64).reshape(-1, 8)
     position, source, plane, cosine, level, limit, seen, alone = table.unbind(-1)
 
     def decibels(value: Tensor) -> Tensor:
         return 10 * torch.log10(value.clamp_min(1e-12))
 
-    numbers = (position.long(), source.long(), plane.long(), cosine)
+    numbers = (position.long(), source.long(), plane.long(), torch.cat(points), cosine)
     return Glints(*numbers, decibels(level), decibels(limit), seen > 0, alone > 0)
+
+
+def ray_powers(one: Spectrum, arrival: Tensor) -> tuple[Tensor, Tensor]:
+    """Powers `[k]` of beams along `arrival` `[k, 3]` (world) in a spectrum `[row, col]`, and the levels around them.
+
+    All beams are solved for together, by least squares of relative errors without negative powers, so that the skirt of
+    a strong one is not taken for a weak one beside it. The level around is the median of the ring of 2 to 4 lobes, but
+    for pixels beside other beams; NaN where the grid does not look there.
+    """
+    lobe = one.instrument.lobe
+    directions, seen = one.directions.reshape(-1, 3), one.power.reshape(-1).double()
+    angle = torch.acos((arrival @ directions.mT).clamp(-1, 1))
+    close = angle < 1.5 * lobe
+    taken = close.sum(0)
+    rings = []
+    for row in range(len(arrival)):
+        ring = (angle[row] > 2 * lobe) & (angle[row] < 4 * lobe)
+        clear = ring & (taken == 0)
+        values = seen[clear if int(clear.sum()) >= LEAST_RING else ring]
+        rings.append(float(values.median()) if len(values) else math.nan)
+    ring = torch.tensor(rings, dtype=torch.float64)
+    known = torch.isfinite(ring)
+    pixel = torch.nonzero((angle[known] < max(0.75 * lobe, 0.75 * pixel_of(one))).any(0)).squeeze(-1)
+    nearest = torch.where(known[:, None], angle[:, pixel], torch.inf).argmin(0)
+    base = ring[nearest]
+    design = one.instrument.kernel(angle[:, pixel]).double().mT
+    weight = 1 / (seen[pixel] + base).clamp_min(1e-30)
+    scale = ring.nan_to_num(0.0).clamp_min(1e-30)
+    matrix, target = design * weight[:, None] * scale, (seen[pixel] - base) * weight
+    free = known.clone()
+    power = torch.zeros_like(ring)
+    for _ in range(len(arrival)):
+        part = matrix[:, free]
+        normal = part.mT @ part + 1e-9 * torch.eye(part.shape[1], dtype=torch.float64)
+        found = torch.linalg.solve(normal, part.mT @ target)
+        power = torch.zeros_like(ring)
+        power[free] = found * scale[free]
+        if bool((found >= 0).all()):
+            break
+        free = free & (power > 0)
+    return power.clamp_min(0.0), ring
 
 
 def fit_reflection(found: Glints, count: int) -> Tensor:
@@ -102,3 +151,33 @@ def fit_reflection(found: Glints, count: int) -> Tensor:
         start = torch.tensor(DIELECTRIC, dtype=torch.float64)
         common = (stiff * own[heard].sum(0) + loose * start) / (stiff * int(heard.sum()) + loose)
     return own.clamp(-200, 200).float()
+
+
+def fit_marks(found: Glints, reflection: Tensor) -> Marks | None:
+    """Where planes reflect otherwise than `reflection` `[P, 3]` says, or None where that predicts no better.
+
+    Every isolated peak marks the place of its reflection with what it deviates, but for deep losses that hardly stand
+    over their surroundings. The width is the one that predicts each mark best from the others.
+    """
+    design = torch.stack((torch.ones_like(found.cosine), found.cosine, found.cosine**2), -1)
+    predicted = (design * reflection[found.plane].double()).sum(-1).clamp_max(0.0)
+    miss = found.level_db - predicted
+    doubtful = (miss < -DOUBTFUL_DB) & (found.level_db < found.limit_db + DOUBTFUL_DB)
+    use = found.alone & found.seen & ~doubtful
+    if int(use.sum()) < LEAST_MARKS:
+        return None
+    points, plane, level_db = found.point[use], found.plane[use], miss[use].clamp(-MOST_DB, MOST_DB).float()
+    best, least = None, float(level_db.abs().mean())
+    for width in WIDTHS:
+        marks = Marks(points, plane, level_db, width)
+        error = float((level_db - marks.at(points, plane, leave_out=True)).abs().mean())
+        if error < least - WORTH_DB:
+            best, least = marks, error
+    return best
+
+
+def silent_planes(found: Glints, count: int) -> Tensor:
+    """True `[count]` for planes whose images were looked for and mostly not seen."""
+    asked = torch.bincount(found.plane[found.alone], minlength=count)
+    heard = torch.bincount(found.plane[found.alone & found.seen], minlength=count)
+    return (asked >= SILENT_LEAST) & (heard < SILENT_SHARE * asked)

@@ -1,6 +1,5 @@
-"""The point sources of a field, out of spectra and geometry: steps 1 to 5 of docs/theory/radiance.md, in closed form."""
+"""The point sources of a field, out of spectra and geometry, in closed form: see docs/theory/radiance.md."""
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -8,14 +7,15 @@ from torch import Tensor
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.field.images import HIGHEST_ORDER, fold, image_chain, sequences
+from rf3dgs.field.images import HIGHEST_ORDER, sequences
 from rf3dgs.field.sources import PointSources, Rays
 from rf3dgs.geometry import Surfaces
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
 from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
-from rf3dgs.training.reflection import Glints, fit_reflection, glints
+from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_marks, fit_reflection, glints, silent_planes
+from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, refined_planes, with_mirrors
 
 PROBES = 150
 PROBE_MARGIN = 0.5
@@ -59,43 +59,72 @@ def fit_sources(
     if surfaces is None or config.order == 0 or not len(surfaces.planes):
         return SourceFit(direct, seen, direct.rays_each(positions, obstacles, in_sight=seen))
     probes = torch.cat((positions, _probes(positions, config.seed)))
-    sources = with_images(direct, surfaces, probes, replace(config, order=1))
+    sources = _known(direct, surfaces)
+    sources = with_images(sources, probes, replace(config, order=1))
+    peaks = peaks_of(spectra) if config.refine or config.complete else None
+    if peaks is not None and config.refine:
+        sources = _refined(sources, seen, peaks, positions, obstacles, config)
+    if peaks is not None and config.complete:
+        every = _fitted(sources, spectra, seen, obstacles)
+        every = with_images(every, probes, config)
+        mirrors = find_mirrors(every, every.rays_each(positions, obstacles, in_sight=seen), peaks, spectra, obstacles)
+        if mirrors:
+            sources = completed(sources, *with_mirrors(sources, mirrors)[:2])
+            sources = with_images(sources, probes, replace(config, order=1))
+            sources = _refined(sources, seen, peaks, positions, obstacles, config)
     rays = sources.rays_each(positions, obstacles, in_sight=seen)
     found = glints(sources, rays, spectra)
-    sources = replace(sources, reflection=fit_reflection(found, len(surfaces.planes)))
-    sources = with_images(sources, surfaces, probes, config)
+    reflection = fit_reflection(found, len(sources.planes))
+    sources = replace(sources, reflection=reflection, marks=fit_marks(found, reflection))
+    sources = with_images(sources, probes, config, silent=silent_planes(found, len(sources.planes)))
     sources = _strongest(sources, probes, obstacles, spectra, config)
     rays = sources.rays_each(positions, obstacles, in_sight=seen)
-    return SourceFit(sources, seen, rays, surfaces.plane_of, glints(sources, rays, spectra))
+    return SourceFit(sources, seen, rays, surfaces.plane_of, found)
 
 
-def with_images(sources: PointSources, surfaces: Surfaces, probes: Tensor, config: SourceConfig) -> PointSources:
-    """The sources with all images up to `config.order` that reach one of the `probes` `[n, 3]` over surface."""
-    planes, patches = surfaces.planes, surfaces.patches
-    areas = patches.areas
-    order = areas.argsort(descending=True, stable=True)[: config.planes]
-    third = order[: config.largest] if config.order >= 3 else None
-    rows = sequences(len(order), min(config.order, 2))
-    rows = torch.where(rows >= 0, order[rows.clamp_min(0)], -1)
-    if third is not None:
-        extra = sequences(len(third), 0, third=torch.arange(len(third)))[1:]
-        rows = torch.cat((rows, third[extra]))
-    reflection = sources.reflection
-    if len(reflection) != len(planes):
-        reflection = fit_reflection(_nothing(), len(planes))
-    whole = replace(sources, planes=planes, patches=patches, reflection=reflection, sequence=rows)
+def with_images(
+    sources: PointSources, probes: Tensor, config: SourceConfig, *, silent: Tensor | None = None
+) -> PointSources:
+    """The sources with all images up to `config.order` that reach one of the `probes` `[n, 3]` over surface.
+
+    Planes that are `silent` `[P]` mirror nothing.
+    """
+    assert sources.patches is not None
+    areas = sources.patches.areas
+    if silent is not None:
+        areas = torch.where(silent, -1.0, areas)
+    largest = areas.argsort(descending=True, stable=True)[: config.planes]
+    largest = largest[areas[largest] >= 0]
+    rows = sequences(len(largest), min(config.order, 2))
+    if config.order >= 3:
+        rows = torch.cat((rows, sequences(0, 0, third=torch.arange(min(config.largest, len(largest))))[1:]))
+    if len(largest):
+        rows = torch.where(rows >= 0, largest[rows.clamp_min(0)], -1)
     kept = [torch.zeros(1, dtype=torch.long)]
     for chunk in torch.arange(1, len(rows)).split(max(1, ROWS_AT_ONCE // len(probes))):
-        part = replace(whole, sequence=torch.cat((rows[:1], rows[chunk])))
-        reached = part.folded(probes)[1].any(0)[1:]
-        kept.append(chunk[reached])
-    return replace(whole, sequence=rows[torch.cat(kept)])
+        part = replace(sources, sequence=torch.cat((rows[:1], rows[chunk])))
+        kept.append(chunk[part.folded(probes)[1].any(0)[1:]])
+    return replace(sources, sequence=rows[torch.cat(kept)])
 
 
-def _nothing() -> Glints:
-    empty, number = torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.long)
-    flag = torch.zeros(0, dtype=torch.bool)
-    return Glints(number, number, number, empty, empty, empty, flag, flag)
+def _known(direct: PointSources, surfaces: Surfaces) -> PointSources:
+    """The transmitter among the planes of the geometry, which reflect as dielectrics do, so far."""
+    reflection = torch.tensor(DIELECTRIC).expand(len(surfaces.planes), 3)
+    return replace(direct, planes=surfaces.planes, patches=surfaces.patches, reflection=reflection)
+
+
+def _fitted(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Obstacles) -> PointSources:
+    """The sources with what each plane reflects."""
+    rays = sources.rays_each(spectra.pose.position, obstacles, in_sight=seen)
+    return replace(sources, reflection=fit_reflection(glints(sources, rays, spectra), len(sources.planes)))
+
+
+def _refined(
+    sources: PointSources, seen: Tensor, peaks: Peaks, positions: Tensor, obstacles: Obstacles, config: SourceConfig
+) -> PointSources:
+    """The sources with their planes where the peaks of the images are."""
+    rays = sources.rays_each(positions, obstacles, in_sight=seen)
+    return replace(sources, planes=refined_planes(sources, rays, peaks, positions, config))
 
 
 def _probes(positions: Tensor, seed: int) -> Tensor:
@@ -115,7 +144,7 @@ def _strongest(
         if not len(rays):
             continue
         top = spectra.power[number].max() if number < len(spectra) else torch.maximum(rays.power.max(), 0.01 * peak)
-        best.index_reduce_(0, rays.index, rays.power / top, "amax")
+        best = torch.maximum(best, torch.zeros_like(best).index_put((rays.index,), rays.power / top))
     order = best[1:].argsort(descending=True, stable=True)[: config.most] + 1
     kept = order[best[order] > floor].sort().values
     return replace(sources, sequence=sources.sequence[torch.cat((torch.zeros(1, dtype=torch.long), kept))])

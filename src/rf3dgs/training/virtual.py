@@ -25,6 +25,7 @@ from rf3dgs.training.line_of_sight import SEEN_OVER_RING, standing_out
 PEAKS = 16
 MATCH = math.radians(3.0)
 BEARING = math.radians(0.3)
+INDEPENDENT = 6  # bearings count as so many at most: what stands beside a peak pulls all of them alike
 STEPS = 6
 LEAST_SUPPORT, LEAST_SHARE = 5, 0.1
 MOST_FOUND = 12
@@ -117,7 +118,7 @@ def _moved(
         step = 1e-4
         slope = torch.stack([(bearings_of(shift + step * one) - here) / step for one in torch.eye(3).double()], -1)
         size = torch.linalg.vector_norm(miss, dim=-1)
-        weight = (BEARING / size.clamp_min(BEARING)) ** 2 / BEARING**2
+        weight = (BEARING / size.clamp_min(BEARING)) ** 2 / BEARING**2 * min(1.0, INDEPENDENT / len(size))
         left = torch.einsum("nik,n,nij->kj", slope, weight, slope) + torch.diag(1 / spread**2)
         right = torch.einsum("nik,n,ni->k", slope, weight, miss) - shift / spread**2
         shift = shift + torch.linalg.solve(left, right)

@@ -1,0 +1,237 @@
+"""Sources fitted to spectra of a room of mirrors, whose truth is the shoebox tracer's."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from rf3dgs.channel.paths import Paths
+from rf3dgs.core.angles import angle_between
+from rf3dgs.core.errors import InputError
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import equirect_grid
+from rf3dgs.field.images import sequences
+from rf3dgs.field.sources import PointSources
+from rf3dgs.geometry import Patches, Planes, Surfaces
+from rf3dgs.propagation.room import shoebox
+from rf3dgs.spectra.scan import spectrum_of
+from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.splats.obstacles import Obstacles
+from rf3dgs.training.config import SourceConfig
+from rf3dgs.training.radio_views import ruled
+from rf3dgs.training.reflection import fit_marks, fit_reflection, glints, silent_planes
+from rf3dgs.training.source_fit import fit_sources
+
+SIZE = torch.tensor([9.0, 7.0, 3.2])
+TX = torch.tensor([2.1, 1.7, 2.6])
+FREQUENCY = 60e9
+GAMMA_DB = (-6.0, -9.0, -12.0, -7.0, -10.0, -8.0)
+FREE = Obstacles(torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0))
+
+
+def receivers(count: int, seed: int) -> Pose:
+    generator = torch.Generator().manual_seed(seed)
+    return Pose(0.7 + (SIZE - 1.4) * torch.rand(count, 3, generator=generator) * torch.tensor([1.0, 1.0, 0.7]))
+
+
+def traced(pose: Pose) -> Paths:
+    return shoebox(SIZE.tolist(), Pose(TX), pose, FREQUENCY, 2, [-(10 ** (level / 20)) for level in GAMMA_DB])
+
+
+def measured(pose: Pose) -> Spectrum:
+    """Paths of at most two reflections through a lobe of 4 degrees, over a haze of power from everywhere."""
+    spectrum = spectrum_of(traced(pose), None, equirect_grid(180, 90), lobe=math.radians(4.0))
+    generator = torch.Generator().manual_seed(1)
+    haze = 3e-5 * spectrum.power.amax((-2, -1), keepdim=True)
+    return replace(
+        spectrum, power=spectrum.power + haze * (0.5 + torch.rand(spectrum.power.shape, generator=generator))
+    )
+
+
+def walls(*, without: int | None = None, turned_deg: float = 0.0, moved: float = 0.0) -> Surfaces:
+    """The six walls, or five; each turned about its middle and moved by as much as said."""
+    normals, offsets, points = [], [], []
+    generator = torch.Generator().manual_seed(2)
+    for axis in range(3):
+        for high in (0, 1):
+            if 2 * axis + high == without:
+                continue
+            spots = torch.rand(4000, 3, generator=generator) * SIZE
+            spots[:, axis] = SIZE[axis] * high
+            normal = torch.eye(3)[axis] * (1.0 - 2.0 * high)
+            lean = torch.eye(3)[(axis + 1) % 3]
+            turn = math.radians(turned_deg)
+            turned = math.cos(turn) * normal + math.sin(turn) * lean
+            middle = spots.mean(0)
+            normals.append(turned)
+            offsets.append(turned @ middle + moved)
+            points.append(spots)
+    planes = Planes(torch.stack(normals), torch.stack(offsets))
+    none = torch.zeros(0, dtype=torch.long)
+    return Surfaces(planes, Patches.of(planes, points), none, none, torch.zeros(0, 3))
+
+
+@pytest.fixture(scope="module")
+def spectra() -> Spectrum:
+    return measured(receivers(16, 0))
+
+
+@pytest.fixture(scope="module")
+def fitted(spectra):
+    return fit_sources(spectra, walls(), FREE, Pose(TX), SourceConfig(complete=False))
+
+
+def missed(sources: PointSources, count: int = 8, seed: int = 9) -> tuple[float, float, float]:
+    """Share of the tracer's paths within 25 dB that no ray is within 1 degree and 1 ns of; their errors otherwise."""
+    pose = receivers(count, seed)
+    paths, lost, total, angles, levels = traced(pose), 0, 0, [], []
+    for number, rays in enumerate(sources.rays_each(pose.position, FREE)):
+        gain = paths.path_gain[number]
+        for path in torch.nonzero(gain > 3e-3 * gain.max()).squeeze(-1).tolist():
+            angle = torch.rad2deg(angle_between(rays.arrival, paths.aoa[number, path].expand(len(rays), 3)))
+            good = (angle < 1.0) & ((rays.delay - paths.delay[number, path]).abs() < 1e-9)
+            total += 1
+            if not bool(good.any()):
+                lost += 1
+                continue
+            best = int(torch.where(good, angle, torch.inf).argmin())
+            angles.append(float(angle[best]))
+            levels.append(abs(float(10 * torch.log10(rays.power[best] / gain[path]))))
+    return lost / total, float(torch.tensor(angles).median()), float(torch.tensor(levels).median())
+
+
+def test_all_images_of_known_walls_are_found_with_their_level(fitted):
+    lost, angle, level_db = missed(fitted.sources)
+    assert lost == 0.0
+    assert angle < 0.2
+    assert level_db < 0.5
+    for plane, truth in enumerate(GAMMA_DB):
+        a, b, c = fitted.sources.reflection[plane].tolist()
+        cosine = fitted.found.cosine[(fitted.found.plane == plane) & fitted.found.alone].median()
+        assert abs(float(a + b * cosine + c * cosine**2) - truth) < 1.0
+    assert bool(fitted.seen.all())
+    assert abs(fitted.sources.level_db) < 0.3
+
+
+def test_the_walls_are_refined_by_the_peaks(spectra):
+    """Walls that are 2 degrees and 4 cm off lose paths; the bearings of their images bring them back."""
+    wrong = walls(turned_deg=1.5, moved=0.03)
+    loose = SourceConfig(complete=False, plane_error=0.05, plane_error_deg=2.0)
+    kept = fit_sources(spectra, wrong, FREE, Pose(TX), replace(loose, refine=False)).sources
+    moved = fit_sources(spectra, wrong, FREE, Pose(TX), loose).sources
+    before, after = missed(kept), missed(moved)
+    assert before[0] > 0.2
+    assert after[0] < 0.1
+    cosine = (moved.planes.normals * walls().planes.normals).sum(-1).clamp(-1, 1)
+    assert math.degrees(float(cosine.arccos().median())) < 0.4
+
+
+def test_a_wall_that_geometry_lacks_is_found_from_the_peaks(spectra):
+    """Without the east wall its image is met by bearings; the plane is the bisector, and its surface where it shone."""
+    for without in (1, 5):
+        fit = fit_sources(spectra, walls(without=without), FREE, Pose(TX), SourceConfig())
+        truth = walls().planes
+        alike = (fit.sources.planes.normals @ truth.normals[without]).abs() > math.cos(math.radians(1.0))
+        near = (fit.sources.planes.offsets.abs() - truth.offsets[without].abs()).abs() < 0.1
+        assert bool((alike & near).any())
+        known = missed(
+            fit_sources(spectra, walls(without=without), FREE, Pose(TX), SourceConfig(complete=False)).sources
+        )
+        assert missed(fit.sources)[0] < 0.75 * known[0]
+
+
+def test_points_rule_the_pixels_of_their_beams(fitted, spectra):
+    for number in range(3):
+        share, rule = ruled(spectra[number], fitted.rays[number])
+        assert bool((share >= 0).all())
+        assert 0.003 < float(rule.float().mean()) < 0.3
+        strong = fitted.rays[number].power > 1e-2 * fitted.rays[number].power.max()
+        pixel, _ = spectra.grid.pixel_of(fitted.rays[number].arrival[strong])
+        col, row = pixel.long().unbind(-1)
+        assert bool(rule[row.clamp_max(89), col.clamp_max(179)].all())
+
+
+def test_a_door_in_a_wall_is_marked():
+    """Levels of one plane that are 12 dB higher in one part than in the other are told by the place."""
+    spectra = measured(receivers(24, 3))
+    fit = fit_sources(spectra, walls(), FREE, Pose(TX), SourceConfig(order=1, complete=False, refine=False))
+    found = fit.found
+    door = (found.plane == 3) & (found.point[:, 0] > 4.5)
+    louder = replace(found, level_db=found.level_db + 12.0 * door)
+    reflection = fit_reflection(louder, 6)
+    marks = fit_marks(louder, reflection)
+    assert marks is not None
+    sources = replace(fit.sources, reflection=reflection, marks=marks)
+    plain = replace(sources, marks=None)
+    wall = louder.alone & louder.seen & (louder.plane == 3)
+    source = found.source[wall]
+    cosine = torch.stack((found.cosine[wall], *[torch.ones(int(wall.sum()))] * 2), -1).float()
+    points = found.point[wall][:, None].expand(-1, 3, 3)
+    errors = [
+        float((one.reflection_db(source, cosine, points)[:, 0] - louder.level_db[wall]).abs().median())
+        for one in (sources, plain)
+    ]
+    assert errors[0] < 1.0
+    assert errors[0] < 0.5 * errors[1]
+
+
+def test_marks_are_left_out_where_planes_are_uniform(fitted):
+    assert fitted.sources.marks is None
+
+
+def test_a_mirror_that_is_nowhere_seen_falls_silent(spectra):
+    """A plane in mid-room that reflects nothing: its image is looked for and not seen."""
+    true = walls()
+    middle = torch.rand(4000, 3, generator=torch.Generator().manual_seed(4)) * SIZE
+    middle[:, 0] = 7.5
+    normals = torch.cat((true.planes.normals, torch.tensor([[-1.0, 0.0, 0.0]])))
+    planes = Planes(normals, torch.cat((true.planes.offsets, torch.tensor([-7.5]))))
+    points = [*(_spots(true, plane) for plane in range(6)), middle]
+    surfaces = replace(true, planes=planes, patches=Patches.of(planes, points))
+    fit = fit_sources(spectra, surfaces, FREE, Pose(TX), SourceConfig(refine=False, complete=False))
+    assert bool(silent_planes(fit.found, 7)[6])
+    assert not bool((fit.sources.sequence == 6).any())
+
+
+def _spots(surfaces: Surfaces, plane: int) -> torch.Tensor:
+    from rf3dgs.training.virtual import surface_points
+
+    return surface_points(surfaces.planes, surfaces.patches, plane)
+
+
+def test_peaks_that_are_not_seen_lower_a_plane_and_do_not_raise_it():
+    sources = PointSources(
+        TX, FREQUENCY, walls().planes, None, sequences(6, 1), torch.tensor([-8.0, 0.0, 0.0]).expand(6, 3)
+    )
+    pose = receivers(10, 5)
+    spectra = measured(pose)
+    found = glints(sources, sources.rays_each(pose.position, FREE), spectra)
+    deaf = replace(found, seen=torch.zeros_like(found.seen), limit_db=torch.full_like(found.limit_db, -30.0))
+    level = fit_reflection(deaf, 6).sum(-1)
+    assert float(level.max()) < -25.0
+    above = replace(deaf, limit_db=torch.full_like(found.limit_db, 0.0))
+    torch.testing.assert_close(
+        fit_reflection(above, 6),
+        fit_reflection(found.__class__(*[getattr(found, name)[:0] for name in found.__dataclass_fields__]), 6),
+        atol=0.5,
+        rtol=0,
+    )
+
+
+def test_the_same_seed_gives_the_same_sources(spectra, fitted):
+    again = fit_sources(spectra, walls(), FREE, Pose(TX), SourceConfig(complete=False))
+    assert torch.equal(again.sources.sequence, fitted.sources.sequence)
+    assert torch.equal(again.sources.reflection, fitted.sources.reflection)
+
+
+def test_no_planes_leave_the_line_of_sight(spectra):
+    for surfaces, config in ((None, SourceConfig()), (walls(), SourceConfig(order=0))):
+        fit = fit_sources(spectra, surfaces, FREE, Pose(TX), config)
+        assert len(fit.sources) == 1
+        assert [rays.order.tolist() for rays in fit.rays] == [[0]] * len(spectra)
+
+
+def test_an_order_that_is_not_offered_is_refused(spectra):
+    with pytest.raises(InputError, match="order must be from 0 to 3; got 4"):
+        fit_sources(spectra, walls(), FREE, Pose(TX), SourceConfig(order=4))
