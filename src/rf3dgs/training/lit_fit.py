@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.units import SPEED_OF_LIGHT
-from rf3dgs.field.lit import AMBIENT_DISTANCE, HARMONICS, LARGEST_RESIDUAL_DB, LAW, incidence
+from rf3dgs.field.lit import AMBIENT_DISTANCE, HARMONICS, LARGEST_RESIDUAL_DB, incidence
 from rf3dgs.field.radiance import NANOSECOND, bounce
 from rf3dgs.splats.harmonics import C0, basis, view_directions
 from rf3dgs.training.lit_views import Observations
@@ -156,6 +156,7 @@ class Ridge:
 
 
 RIDGE = Ridge()
+
 
 def fit_residual(
     scattering: Scattering, seen: Observations, laws: Tensor, ridge: Ridge = RIDGE

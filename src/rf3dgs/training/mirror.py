@@ -44,9 +44,7 @@ def fit_mirror(
     positions = spectra.pose.position
     surfaces = find_surfaces(geometry, positions)
     progress.update(1)
-    obstacles = Obstacles(
-        geometry.means, geometry.quats, geometry.scales, geometry.opacities, surfaces.plane_of
-    )
+    obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, geometry.opacities, surfaces.plane_of)
     found = fit_sources(spectra, surfaces, obstacles, tx)
     progress.update(2)
     views = lit_views(spectra, found.rays)
