@@ -5,16 +5,18 @@ law for everything, then each segment's own, drawn to the common one as if that 
 remains is a linear problem in dB: harmonics of segments and cells and a level for each Gaussian, by ridge regression.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from rf3dgs.core.units import SPEED_OF_LIGHT
-from rf3dgs.field.lit import AMBIENT_DISTANCE, HARMONICS, LARGEST_RESIDUAL_DB, incidence
+from rf3dgs.field.lit import AMBIENT_DISTANCE, HARMONICS, LARGEST_RESIDUAL_DB, LitSurface, incidence
 from rf3dgs.field.radiance import NANOSECOND, bounce
 from rf3dgs.splats.harmonics import C0, basis, view_directions
-from rf3dgs.training.lit_views import Observations
+from rf3dgs.splats.rasterize import Backend
+from rf3dgs.training.lit_views import LitView, Observations, Shortfall, shortfall
 
 SOFT_DB = 3.0  # where soft-L1 turns from squares to absolute values
 SHRINK = 30.0  # [pixel]
@@ -26,6 +28,8 @@ STEPS = 12
 DARK = 1e-4  # visibility below which nothing arrives straight
 DB = 10 / 2.302585092994046
 MOST = 400_000
+ROWS_AT_ONCE = 50_000
+BAND = torch.tensor([degree for degree in range(4) for _ in range(2 * degree + 1)], dtype=torch.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,48 +154,53 @@ def _refine(
 class Ridge:
     """How strongly each level of the residual is drawn to zero, in pixels that say so."""
 
-    segment: float = 100.0
-    cell: float = 100.0
-    level: float = 5.0
+    segment: float = 30.0
+    cell: float = 30.0
+    level: float = 2.0
 
 
 RIDGE = Ridge()
 
 
-def fit_residual(
-    scattering: Scattering, seen: Observations, laws: Tensor, ridge: Ridge = RIDGE
-) -> tuple[Tensor, Tensor, Tensor]:
-    """segment_sh `[S, 16]`, cell_sh `[C, 16]` and level `[N]` of what the laws leave over, in dB."""
-    count = len(scattering.means)
-    segments, cells = len(laws), int(scattering.cell_of.max()) + 1
-    worth = _worth(seen.weight)
-    along = _along(scattering, seen)
-    lit, ambient = law_db(laws[scattering.segment_of[seen.gaussian]], _known(scattering, seen.gaussian, along))
-    left_over = seen.level_db - torch.logaddexp(lit / DB, ambient / DB) * DB
-    robust = worth / (1 + (left_over / SOFT_DB).square()).sqrt()
-    harmonics = basis(along, 3)
-    band = torch.tensor([degree for degree in range(4) for _ in range(2 * degree + 1)], dtype=torch.float32)
-    penalty = (1.0 + band) ** 2
-    fitted = []
+def refine_residual(
+    surface: LitSurface, views: Sequence[LitView], *, passes: int, ridge: Ridge = RIDGE, backend: Backend = "auto"
+) -> LitSurface:
+    """The surface with the residual that makes up for what it lacks in `views`, in so many passes.
+
+    Each pass renders the views, throws their errors in dB back onto the Gaussians, and solves for what is lacking from
+    coarse to fine: harmonics of segments, harmonics of cells, levels.
+    """
+    for _ in range(passes):
+        lacking = shortfall(surface, views, surface.window.floor_db, backend)
+        surface = _corrected(surface, views, lacking, ridge)
+    return surface
+
+
+def _corrected(surface: LitSurface, views: Sequence[LitView], lacking: Shortfall, ridge: Ridge) -> LitSurface:
+    receivers = torch.stack([one.view.position for one in views])
+    along = view_directions(surface.means[lacking.gaussian] - receivers[lacking.view], torch.zeros(3))
+    harmonics, weight = basis(along, 3), _worth(lacking.weight)
+    left_over = lacking.error_db
+    penalty = C0**2 * torch.diag((1.0 + BAND) ** 2)
+    found = []
     for group, groups, strength in (
-        (scattering.segment_of, segments, ridge.segment),
-        (scattering.cell_of, cells, ridge.cell),
+        (surface.segment_of, len(surface.laws), ridge.segment),
+        (surface.cell_of, len(surface.cell_sh), ridge.cell),
     ):
-        number = group[seen.gaussian]
-        left = torch.zeros(groups, HARMONICS * HARMONICS)
-        right = torch.zeros(groups, HARMONICS)
-        for part in torch.arange(len(seen)).split(50_000):
-            weighted = harmonics[part] * robust[part, None]
-            products = (weighted[:, :, None] * harmonics[part][:, None, :]).reshape(len(part), -1)
-            left.index_add_(0, number[part], products)
+        number = group[lacking.gaussian]
+        left, right = torch.zeros(groups, HARMONICS**2), torch.zeros(groups, HARMONICS)
+        for part in torch.arange(len(lacking)).split(ROWS_AT_ONCE):
+            weighted = harmonics[part] * weight[part, None]
+            products = weighted[:, :, None] * harmonics[part][:, None, :]
+            left.index_add_(0, number[part], products.reshape(len(part), -1))
             right.index_add_(0, number[part], weighted * left_over[part, None])
-        matrix = left.reshape(groups, HARMONICS, HARMONICS) + torch.diag(strength * C0**2 * penalty)
-        found = torch.linalg.solve(matrix, right)
-        left_over = left_over - (harmonics * found[number]).sum(-1)
-        fitted.append(found)
-    total = torch.zeros(count).index_add_(0, seen.gaussian, robust)
-    level = torch.zeros(count).index_add_(0, seen.gaussian, robust * left_over) / (total + ridge.level)
-    return fitted[0], fitted[1], level.clamp(-LARGEST_RESIDUAL_DB, LARGEST_RESIDUAL_DB)
+        correction = torch.linalg.solve(left.reshape(groups, HARMONICS, HARMONICS) + strength * penalty, right)
+        left_over = left_over - (harmonics * correction[number]).sum(-1)
+        found.append(correction)
+    total = torch.zeros(len(surface)).index_add_(0, lacking.gaussian, weight)
+    own = torch.zeros(len(surface)).index_add_(0, lacking.gaussian, weight * left_over) / (total + ridge.level)
+    level = (surface.level + own).clamp(-LARGEST_RESIDUAL_DB, LARGEST_RESIDUAL_DB)
+    return replace(surface, segment_sh=surface.segment_sh + found[0], cell_sh=surface.cell_sh + found[1], level=level)
 
 
 def fit_ambient(scattering: Scattering, seen: Observations, laws: Tensor, ridge: float = 1.0) -> Tensor:

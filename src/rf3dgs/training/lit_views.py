@@ -13,7 +13,7 @@ from torch import Tensor
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import View, view_of
-from rf3dgs.field.lit import BLENDING
+from rf3dgs.field.lit import BLENDING, LitSurface
 from rf3dgs.field.radiance import NANOSECOND
 from rf3dgs.field.sources import Rays
 from rf3dgs.spectra.spectrum import Spectrum
@@ -23,6 +23,7 @@ from rf3dgs.training.radio_views import ruled
 
 LEAST_WEIGHT = 0.02  # [pixel]; what a view tells of fainter Gaussians is left out
 LEAST_POWER = 1e-30
+FARTHEST_DB = 15.0  # errors of pixels beyond this count as this
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +52,20 @@ class Observations:
     level_db: Tensor
     csi: Tensor | None
     receivers: Tensor
+
+    def __len__(self) -> int:
+        return len(self.gaussian)
+
+
+@dataclass(frozen=True, eq=False)
+class Shortfall:
+    """What a surface lacks, one row for each pair of Gaussian and view: gaussian, view `[M]` long; weight `[M]`: pixels
+    times the Gaussian's share in their power; error_db `[M]`: mean of truth over model, weighted so."""
+
+    gaussian: Tensor
+    view: Tensor
+    weight: Tensor
+    error_db: Tensor
 
     def __len__(self) -> int:
         return len(self.gaussian)
@@ -105,3 +120,31 @@ def observe(geometry: Gaussians, views: Sequence[LitView], *, unit: float, backe
         csi=sums[:, 2:] / sums[:, 1:2] if has_csi else None,
         receivers=torch.stack([one.view.position for one in views]),
     )
+
+
+def shortfall(surface: LitSurface, views: Sequence[LitView], floor_db: float, backend: Backend = "auto") -> Shortfall:
+    """What `surface` lacks in `views`, thrown back onto the Gaussians by their share in each pixel's power.
+
+    The share is the derivative of a pixel's level in a Gaussian's. Levels under `floor_db` count as that.
+    """
+    shape = (surface.means, surface.quats, surface.scales, surface.opacities)
+    rows = []
+    for number, one in enumerate(views):
+        with torch.no_grad():
+            sent = surface.values(one.view.position, csi=False)
+        values = sent.expand(-1, 2).contiguous().requires_grad_()
+        with torch.enable_grad():
+            raster = rasterize(*shape, values, one.view, compositing=BLENDING, backend=backend)
+            shown = raster.values.detach()[..., 0]
+            there = one.keep * (shown > 0)
+            floor = 10 ** (floor_db / 10) / surface.unit
+            truth = (one.channels[..., 0] / surface.unit).float().clamp_min(floor)
+            error = 10 * torch.log10(truth / shown.clamp_min(floor))
+            share = there / torch.where(shown > 0, shown, 1.0)
+            upstream = torch.stack((share, share * error.clamp(-FARTHEST_DB, FARTHEST_DB)), -1)
+            (sums,) = torch.autograd.grad(raster.values, values, upstream)
+        sums = sums * sent
+        chosen = (sums[:, 0] > LEAST_WEIGHT).nonzero().squeeze(-1)
+        rows.append((chosen, torch.full_like(chosen, number), sums[chosen]))
+    gaussian, view, sums = (torch.cat(part) for part in zip(*rows, strict=True))
+    return Shortfall(gaussian, view, sums[:, 0].contiguous(), sums[:, 1] / sums[:, 0])

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.progress import Progress
-from rf3dgs.field.lit import LitSurface
+from rf3dgs.field.lit import HARMONICS, LitSurface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.geometry import Surfaces, find_surfaces
 from rf3dgs.spectra.codec import DbWindow
@@ -17,11 +17,12 @@ from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles, visibility_of
 from rf3dgs.training.config import RadioConfig
-from rf3dgs.training.lit_fit import Scattering, fit_ambient, fit_laws, fit_residual
+from rf3dgs.training.lit_fit import Scattering, fit_ambient, fit_laws, refine_residual
 from rf3dgs.training.lit_views import LitView, lit_views, observe
 from rf3dgs.training.source_fit import fit_sources
 
 CELL = 0.8  # m
+PASSES = 3
 STAGES = ("surfaces", "point sources", "observations", "laws", "residual")
 
 
@@ -83,10 +84,7 @@ def fit_surface(
     progress.update(3)
     laws = fit_laws(scattering, seen)
     progress.update(4)
-    segment_sh, cell_sh, level = fit_residual(scattering, seen, laws)
-    ambient = fit_ambient(scattering, seen, laws)
-    progress.update(5)
-    return LitSurface(
+    bare = LitSurface(
         means=geometry.means.detach(),
         quats=geometry.quats.detach(),
         log_scales=geometry.log_scales.detach(),
@@ -96,13 +94,16 @@ def fit_surface(
         segment_of=scattering.segment_of,
         cell_of=scattering.cell_of,
         laws=laws,
-        segment_sh=segment_sh,
-        cell_sh=cell_sh,
-        level=level,
-        ambient=ambient,
+        segment_sh=torch.zeros(len(laws), HARMONICS),
+        cell_sh=torch.zeros(int(cells.max()) + 1, HARMONICS),
+        level=torch.zeros(len(geometry)),
+        ambient=fit_ambient(scattering, seen, laws),
         tx=tx,
         window=window,
     )
+    surface = refine_residual(bare, views, passes=PASSES, backend=config.backend)
+    progress.update(5)
+    return surface
 
 
 def cells_of(means: Tensor, segment_of: Tensor) -> Tensor:
