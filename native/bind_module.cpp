@@ -201,6 +201,7 @@ NB_MODULE(_native, m) {
   m.def("harmonics_backward", &harmonics_backward, nb::arg("gradient").noconvert(), nb::arg("directions").noconvert(),
         nb::arg("out").noconvert(), nb::arg("threads"));
   bind_loss(m);
+  bind_obstacles(m);
   bind_trainer(m);
   bind_floor(m);
   bind_spectra(m);

@@ -13,7 +13,7 @@ errors of what was found. Positions without line of sight are also told apart.
 import argparse
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -125,7 +125,7 @@ def main() -> None:
     geometry = geometry_of(options.geometry)
     surfaces = find_surfaces(geometry, train.pose.position)
     shape = (geometry.means, geometry.quats, geometry.scales, geometry.opacities)
-    obstacles = Obstacles(*shape, surfaces.plane_of)
+    obstacles = Obstacles(*shape)
     print(f"{len(geometry):,} Gaussians, {len(surfaces.planes)} planes, {len(train)} training positions")
     print(f"{'':20} {'found (right) of all, orders 0 1 2 3':52} false/pos  angle  level  no sight  sources  CPU s")
     results = {}
@@ -133,7 +133,7 @@ def main() -> None:
         started = time.process_time()
         fit = fit_sources(train, surfaces, obstacles, open_scene("lobby").tx, VARIANTS[name])
         seconds = time.process_time() - started
-        figures = compare(truths, fit.sources.rays_each(receivers, obstacles))
+        figures = compare(truths, fit.sources.rays_each(receivers, replace(obstacles, labels=fit.plane_of)))
         results[name] = figures | {"sources": float(len(fit.sources)), "seconds": seconds}
         parts = [
             f"{figures[f'found {order}']:.0f} ({figures[f'right {order}']:.0f})/{figures[f'of {order}']:.0f}"

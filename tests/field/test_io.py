@@ -6,8 +6,11 @@ import torch
 
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose
+from rf3dgs.field.images import sequences
 from rf3dgs.field.io import load_field, save_field
 from rf3dgs.field.radio_field import RadioField
+from rf3dgs.field.sources import Marks, PointSources
+from rf3dgs.geometry import Patches, Planes
 
 HERE = Pose([4.0, 3.0, 1.4])
 
@@ -36,6 +39,49 @@ def test_saving_what_was_loaded_changes_nothing(saved, tmp_path):
     assert (tmp_path / "again.field" / "tensors.safetensors").read_bytes() == (
         saved / "tensors.safetensors"
     ).read_bytes()
+
+
+def test_mirrors_come_back_from_disk_and_give_the_same_rays(field, tmp_path):
+    floor = Planes(torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]), torch.tensor([0.0, 0.0]))
+    steps = torch.arange(0.05, 6.0, 0.1)
+    zero = torch.zeros(1)
+    spots = [torch.cartesian_prod(steps, steps, zero), torch.cartesian_prod(zero, steps, steps)]
+    marks = Marks(torch.tensor([[2.0, 2.0, 0.0]]), torch.zeros(1, dtype=torch.long), torch.tensor([4.0]), 0.5)
+    sources = PointSources(
+        field.tx.position,
+        field.frequency,
+        floor,
+        Patches.of(floor, spots),
+        sequences(2, 2),
+        torch.tensor([[-3.0, -5.0, 1.0], [-6.0, 0.0, 0.0]]),
+        level_db=0.5,
+        open_above=0.2,
+        marks=marks,
+    )
+    plane_of = torch.where(field.surface.means[:, 2].abs() < 0.01, 0, -1)
+    mirrors = replace(field, sources=sources, plane_of=plane_of)
+    mirrors.save(tmp_path / "mirrors.field")
+    loaded = load_field(tmp_path / "mirrors.field")
+    assert torch.equal(loaded.plane_of, plane_of)
+    before, after = mirrors.paths(HERE, parts="sources"), loaded.paths(HERE, parts="sources")
+    assert int(before.valid.sum()) >= 3
+    torch.testing.assert_close(before.delay, after.delay)
+    torch.testing.assert_close(before.path_gain, after.path_gain)
+    assert torch.equal(before.order, after.order)
+    save_field(replace(field, sources=None), tmp_path / "bare.field")
+    assert load_field(tmp_path / "bare.field").sources is None
+
+
+def test_fields_of_schema_1_keep_their_line_of_sight(saved, field):
+    def older(body):
+        position = field.tx.position.tolist()
+        body.update(schema=1, sources=[{"position": position, "tx": position, "gain_db": 1.5, "open_above": 0.3}])
+
+    change(saved, older)
+    sources = load_field(saved).sources
+    assert len(sources) == 1
+    assert (sources.level_db, sources.open_above) == (1.5, 0.3)
+    assert torch.equal(sources.tx, field.tx.position)
 
 
 def test_a_field_takes_at_most_a_hundred_bytes_a_gaussian(field, saved):
@@ -90,6 +136,8 @@ def change(saved, edit):
         (lambda body: body.pop("window_db"), "window_db"),
         (lambda body: body.update(gaussians=7), "must be"),
         (lambda body: body.update(encoding="polar"), "polar"),
+        (lambda body: body["sources"].update(planes=3), "lacks the tensor source_plane_normals"),
+        (lambda body: body["sources"].update(tx=[0, 1]), "three finite numbers"),
         (lambda body: body.update(frequency=True), "frequency must be a finite number"),
         (lambda body: body.update(bounds=[[0, 0], [1, 1]]), "bounds must be three numbers"),
         (lambda body: body["tx"].update(orientation=[0, 0, 0, 0]), "zero or non-finite quaternion"),

@@ -1,18 +1,22 @@
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 
+import rf3dgs
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid
 from rf3dgs.core.units import friis_gain
+from rf3dgs.field.radio_field import RadioField
 from rf3dgs.field.sources import PointSources
 from rf3dgs.field.transmitter import estimate_transmitter
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.obstacles import Obstacles
+from rf3dgs.splats.transmittance import segment_transmittance
 from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
 
 
@@ -89,6 +93,21 @@ def test_a_wall_hides_a_source_and_the_threshold_follows_what_was_seen(wall):
     assert 0.01 < float(passed[1]) < 0.9
     fitted = fit_opening(sources, torch.tensor([True, True, True]), receivers, haze)
     assert bool(fitted.sees(receivers, haze).all())
+
+
+def test_the_shipped_field_sees_its_transmitter_where_the_specification_does():
+    assert rf3dgs.__file__ is not None
+    field = RadioField.load(Path(rf3dgs.__file__).parent / "assets" / "lobby.field")
+    low, high = field.bounds.tolist()
+    receivers = Pose.scatter((tuple(low), tuple(high)), 60, 3).position
+    source, obstacles = field.sources, field.obstacles
+    shape = (obstacles.means, obstacles.quats, obstacles.scales, obstacles.opacities)
+    passed = segment_transmittance(*shape, source.tx[None], receivers)
+    clear = (passed - source.open_above).abs() > 3e-3  # float32 cannot tell the others
+    seen = field.sees_transmitter(Pose(receivers))
+    assert seen[clear].tolist() == (passed > source.open_above)[clear].tolist()
+    assert int(clear.sum()) > 50
+    assert 5 < int(seen.sum()) < 60
 
 
 def test_a_beam_is_one_at_its_centre_and_half_at_half_a_lobe():

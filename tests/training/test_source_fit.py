@@ -19,6 +19,7 @@ from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
+from rf3dgs.training.consolidation import surface_points
 from rf3dgs.training.radio_views import ruled
 from rf3dgs.training.reflection import fit_marks, fit_reflection, glints, silent_planes
 from rf3dgs.training.source_fit import fit_sources
@@ -195,8 +196,6 @@ def test_a_mirror_that_is_nowhere_seen_falls_silent(spectra):
 
 
 def _spots(surfaces: Surfaces, plane: int) -> torch.Tensor:
-    from rf3dgs.training.virtual import surface_points
-
     return surface_points(surfaces.planes, surfaces.patches, plane)
 
 

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FitGeometry:
-    """Visual stage: Gaussians from photographs, or from the mesh of a scene."""
+    """Visual stage: Gaussians from photographs, from the mesh of a scene, or from a floor plan."""
 
-    dataset: tyro.conf.Positional[Path]
-    """A dataset folder, or a folder of photographs with poses (COLMAP, nerfstudio, Blender)."""
+    dataset: tyro.conf.Positional[Path | None] = None
+    """A dataset folder, or a folder of photographs with poses (COLMAP, nerfstudio, Blender); none with --mesh, --plan."""
     out: Path = Path("geometry.ply")
     """The 3DGS .ply to write."""
     poses: Literal["given", "sfm"] = "given"
@@ -36,8 +36,10 @@ class FitGeometry:
     """With --poses sfm: estimate a radial distortion, or take rendered and undistorted pictures as they are."""
     mesh: str | None = None
     """Take the geometry from this scene's mesh instead of photographs ("lobby", "box", an XML file)."""
+    plan: Path | None = None
+    """Take the geometry from this floor plan (TOML or JSON) instead of photographs."""
     mesh_count: int = 40_000
-    """Gaussians on a mesh."""
+    """Gaussians on a mesh or a floor plan."""
     visual: VisualConfig = field(default_factory=VisualConfig)
     """The visual stage."""
 
@@ -50,9 +52,18 @@ class FitGeometry:
 
         if self.out.is_dir():
             raise InputError(f"{self.out} is a folder; name the .ply file to write with --out")
+        given = [name for name in ("dataset", "mesh", "plan") if getattr(self, name) is not None]
+        if ("mesh" in given and "plan" in given) or not given:
+            raise InputError(
+                "geometry comes from a folder of photographs, from --mesh or from --plan; "
+                f"got {' and '.join(given) or 'none of them'}"
+            )
         if self.mesh is not None:
             geometry = _from_mesh(self.mesh, self.mesh_count, self.visual.seed)
+        elif self.plan is not None:
+            geometry = geometry_of_plan(self.plan, self.mesh_count, self.visual.seed)
         else:
+            assert self.dataset is not None
             if self.poses == "sfm":
                 found = poses_from_photos(self.dataset, lens=self.lens, progress=console())
             else:
@@ -243,3 +254,12 @@ def _from_mesh(name: str, count: int, seed: int) -> "Gaussians":
     from rf3dgs.cli.facts import open_scene
 
     return geometry_of_mesh(open_scene(name), count, seed)
+
+
+def geometry_of_plan(path: Path, count: int, seed: int) -> "Gaussians":
+    """Flattened Gaussians on the surfaces of a floor plan."""
+    from rf3dgs.geometry.plan import plan_mesh, read_plan
+    from rf3dgs.splats.surface import sample_mesh
+
+    mesh = plan_mesh(read_plan(path))
+    return sample_mesh(mesh.vertices, mesh.faces, count=count, seed=seed, colours=mesh.colours)

@@ -15,6 +15,7 @@ from rf3dgs.cli.check import Doctor, Info, Validate
 from rf3dgs.cli.demo import Demo
 from rf3dgs.cli.exchange import Export, Import
 from rf3dgs.cli.fit import Fit, FitGeometry, FitRadio
+from rf3dgs.cli.geometry import CheckGeometry
 from rf3dgs.cli.judge import Eval
 from rf3dgs.cli.make import MakePhotos, Trace
 from rf3dgs.cli.show import complain, out
@@ -31,6 +32,7 @@ Command = (
     | Annotated[Export, name("export")]
     | Annotated[Fit, name("fit")]
     | Annotated[FitGeometry, name("fit-geometry")]
+    | Annotated[CheckGeometry, name("check-geometry")]
     | Annotated[FitRadio, name("fit-radio")]
     | Annotated[Render, name("render")]
     | Annotated[Csi, name("csi")]

@@ -1,20 +1,32 @@
-"""The planes of a cloud of Gaussians: RANSAC on their normals, refined on what lies on them, each Gaussian on one."""
+"""The planes of a cloud of Gaussians: RANSAC on their normals, refined on what lies on them, each Gaussian on one.
+
+A plane is real where its largest piece is large, wide and flat, where it covers its area, and where it is sharp: little
+else with the same normal lies just beside it. Facets of a round column are too narrow or bend. Where a plane grows by
+letting what lies on it stray farther, it is a rough one and does. What no normals agree on may still be a wall, badly
+photographed: the last round looks for layers of the rest along directions that fit the planes found so far.
+"""
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from rf3dgs.core.frames import matrix_from_quaternion
+from rf3dgs.geometry.cloud import Cloud, Found, bends, fitted, sharpness
 from rf3dgs.geometry.config import SurfaceConfig
-from rf3dgs.geometry.patches import CELL, Patches, footprints, widths
+from rf3dgs.geometry.layers import find_layers, without_haze
+from rf3dgs.geometry.patches import Patches, plane_axes, widths
 from rf3dgs.geometry.planes import Planes
 from rf3dgs.splats.gaussians import Gaussians
 
-SAMPLE = 16_000
-TRIALS = 256
+SAMPLE = 12_000
+NEARBY = 1.0  # every other candidate is judged by what lies within this distance [m]
+TRIALS = 192
 REFINEMENTS = 4
-FAILURES = 12  # candidates that may fail in a row before the search ends
+FAILURES = 40  # candidates in a row that may fail before the search ends
+GROWTH = 1.1  # a rougher plane must be this much larger
+SAME_DIRECTION = 0.996  # cosine of 5 degrees
 
 
 def search_planes(
@@ -22,116 +34,105 @@ def search_planes(
 ) -> tuple[Planes, Tensor, Patches]:
     """Planes, largest first, the plane of each Gaussian `[gaussian]` (-1 none), and where the planes have surface.
 
-    `normals` `[gaussian, 3]` may have either sign; `mass` `[gaussian]` [m^2] is how much surface each covers.
+    `normals` `[gaussian, 3]` point to the free side; `mass` `[gaussian]` [m^2] is how much surface each covers.
     """
     generator = torch.Generator().manual_seed(config.seed)
-    points, directions = gaussians.means.double(), normals.double()
-    opaque = gaussians.opacities >= config.min_opacity
-    weight = torch.where(opaque, mass.clamp_max(mass.quantile(0.98)), 0.0).double()
-    spots, owner = _spots(gaussians)
-    rest = opaque.clone()
-    found: list[tuple[Tensor, Tensor]] = []
+    cloud = Cloud.of(gaussians, normals, mass, config)
+    rest = cloud.mass > 0
+    found: list[Found] = []
     failures = 0
-    while len(found) < config.max_planes and failures < FAILURES and bool(rest.any()):
-        index = rest.nonzero().squeeze(-1)
-        if len(index) > SAMPLE:
-            index = index[torch.randperm(len(index), generator=generator)[:SAMPLE]]
-        plane = _best(points[index], directions[index], weight[index], config, generator)
-        normal, offset = _refined(points, directions, weight, rest, plane, config)
-        lies = rest & _lies(points, directions, normal, offset, config)
-        if not _is_surface(gaussians.means, spots, owner, lies, normal, config):
+    while len(found) < config.max_planes and failures < FAILURES and int(rest.sum()) >= 3:
+        radius = NEARBY if failures % 2 else math.inf
+        seed = _refined(cloud, rest, _best(cloud, rest, radius, config, generator), config)
+        lies = rest & cloud.lies(seed)
+        kept, main, area = cloud.pieces(seed.normal, lies, config.min_width)
+        if is_plane(cloud, seed, main, area, config):
+            plane = _loosened(cloud, rest, seed, area, config)
+            found.append(plane)
+            if plane.tolerance > seed.tolerance:
+                kept = cloud.pieces(plane.normal, rest & cloud.lies(plane), config.min_width)[0]
+            rest &= ~kept
+            failures = 0
+        else:
+            rest &= ~(main if bool(main.any()) else lies)
             failures += 1
-            rest &= ~(lies & _lies(points, directions, normal, offset, config))
-            continue
-        failures = 0
-        found.append((normal, offset))
-        rest &= ~lies
-    if not found:
-        none = Planes(torch.zeros(0, 3), torch.zeros(0))
-        return none, torch.full((len(points),), -1), Patches.of(none, [])
-    planes = Planes(torch.stack([item[0] for item in found]).float(), torch.stack([item[1] for item in found]).float())
-    return _settled(gaussians, normals, planes, spots, owner, config)
+    layers = find_layers(cloud, rest, found, config)
+    return settled(cloud, without_haze(cloud, found, layers), config)
 
 
-def _best(
-    points: Tensor, directions: Tensor, weight: Tensor, config: SurfaceConfig, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    """The candidate plane, through a Gaussian along its normal, on which most mass lies."""
-    trial = torch.multinomial(weight.clamp_min(1e-12), TRIALS, replacement=True, generator=generator)
+def _best(cloud: Cloud, rest: Tensor, radius: float, config: SurfaceConfig, generator: torch.Generator) -> Found:
+    """The candidate, through a Gaussian along its normal, on which most mass lies within `radius` [m] of it."""
+    index = rest.nonzero().squeeze(-1)
+    if len(index) > SAMPLE:
+        index = index[torch.randperm(len(index), generator=generator)[:SAMPLE]]
+    points, directions, mass = cloud.points[index], cloud.normals[index], cloud.mass[index]
+    trial = torch.multinomial(mass, TRIALS, replacement=True, generator=generator)
     normals = directions[trial]
     offsets = (normals * points[trial]).sum(-1)
-    near = ((points @ normals.mT) - offsets).abs() < config.tolerance
-    alike = (directions @ normals.mT).abs() > math.cos(math.radians(config.angle_deg))
-    score = weight @ (near & alike).double()
-    best = int(score.argmax())
-    return normals[best], offsets[best]
+    lies = ((points @ normals.mT) - offsets).abs() < config.tolerance
+    lies &= (directions @ normals.mT) > math.cos(math.radians(config.angle_deg))
+    if radius < math.inf:
+        lies &= torch.cdist(points, points[trial]) < radius
+    best = int((mass @ lies.float()).argmax())
+    return Found(normals[best], offsets[best], config.tolerance, config.angle_deg)
 
 
-def _refined(
-    points: Tensor,
-    directions: Tensor,
-    weight: Tensor,
-    rest: Tensor,
-    plane: tuple[Tensor, Tensor],
-    config: SurfaceConfig,
-) -> tuple[Tensor, Tensor]:
-    """The plane fitted to what lies on it, weighted by mass, a few times over."""
-    normal, offset = plane
+def _refined(cloud: Cloud, rest: Tensor, plane: Found, config: SurfaceConfig) -> Found:
+    """The plane fitted to the largest piece that lies on it, weighted by mass, a few times over."""
     for _ in range(REFINEMENTS):
-        lies = rest & _lies(points, directions, normal, offset, config)
-        part, share = points[lies], weight[lies][:, None]
-        if len(part) < 3:
+        main = cloud.pieces(plane.normal, rest & cloud.lies(plane))[1]
+        if int(main.sum()) < 3:
             break
-        centre = (share * part).sum(0) / share.sum()
-        centred = part - centre
-        fitted = torch.linalg.eigh(centred.mT @ (share * centred)).eigenvectors[:, 0]
-        normal = fitted if float(fitted @ normal) > 0 else -fitted
-        offset = normal @ centre
-    return normal, offset
+        normal, offset = fitted(cloud.points[main], cloud.mass[main], plane.normal)
+        plane = replace(plane, normal=normal, offset=offset)
+    return plane
 
 
-def _lies(points: Tensor, directions: Tensor, normal: Tensor, offset: Tensor, config: SurfaceConfig) -> Tensor:
-    near = (points @ normal - offset).abs() < config.tolerance
-    return near & ((directions @ normal).abs() > math.cos(math.radians(config.angle_deg)))
+def _loosened(cloud: Cloud, rest: Tensor, plane: Found, area: float, config: SurfaceConfig) -> Found:
+    """The plane with twice the tolerance, again and again, as long as its largest piece grows by `GROWTH` that way."""
+    while 2 * plane.tolerance <= config.max_tolerance:
+        wider = _refined(cloud, rest, replace(plane, tolerance=2 * plane.tolerance), config)
+        _, main, larger = cloud.pieces(wider.normal, rest & cloud.lies(wider))
+        same = float(wider.normal @ plane.normal) > SAME_DIRECTION
+        if larger < GROWTH * area or not same or not is_plane(cloud, wider, main, larger, config):
+            break
+        plane, area = wider, larger
+    return plane
 
 
-def _is_surface(
-    means: Tensor, spots: Tensor, owner: Tensor, lies: Tensor, normal: Tensor, config: SurfaceConfig
-) -> bool:
-    """Whether what lies on a plane covers enough of it, in both directions."""
-    part = spots[lies[owner]]
-    if int(lies.sum()) < 3:
+def is_plane(cloud: Cloud, plane: Found, main: Tensor, area: float, config: SurfaceConfig) -> bool:
+    """Whether the Gaussians `main`, a piece of `area` [m^2], make a surface; see the head of this file."""
+    if int(main.sum()) < config.min_count or area < config.min_area:
         return False
-    patch = Patches.of(Planes(normal[None].float(), torch.zeros(1)), [part])
-    if float(patch.cells.sum()) * CELL**2 < config.min_area:
+    points, mass = cloud.points[main], cloud.mass[main]
+    if widths(points, plane_axes(plane.normal[None])[0])[1] < config.min_width:
         return False
-    return widths(means[lies], patch.axes[0])[1] > config.min_width
+    if float(mass.sum()) < config.min_cover * area:
+        return False
+    return sharpness(cloud, plane, main) > config.min_sharpness and not bends(points, mass, plane)
 
 
-def _settled(
-    gaussians: Gaussians, normals: Tensor, planes: Planes, spots: Tensor, owner: Tensor, config: SurfaceConfig
-) -> tuple[Planes, Tensor, Patches]:
-    """Every Gaussian on the nearest plane that has surface there, planes by area."""
-    distance = (gaussians.means @ planes.normals.mT - planes.offsets).abs()
-    alike = (normals @ planes.normals.mT).abs() > math.cos(math.radians(config.angle_deg))
-    opaque = (gaussians.opacities >= config.min_opacity)[:, None]
-    near, plane = torch.where((distance < config.tolerance) & alike & opaque, distance, math.inf).min(-1)
-    plane_of = torch.where(near < math.inf, plane, -1)
-    patches = Patches.of(planes, [spots[plane_of[owner] == index] for index in range(len(planes))])
-    order = patches.areas.argsort(descending=True)
-    planes = Planes(planes.normals[order], planes.offsets[order])
-    place = torch.empty_like(order)
+def settled(cloud: Cloud, found: Sequence[Found], config: SurfaceConfig) -> tuple[Planes, Tensor, Patches]:
+    """Every Gaussian on the nearest plane, in its tolerances, that has a piece of surface there; planes by area."""
+    plane_of = torch.full((len(cloud.points),), -1)
+    nearest = torch.full((len(cloud.points),), math.inf)
+    for index, plane in enumerate(found):
+        distance = (cloud.points @ plane.normal - plane.offset).abs() / plane.tolerance
+        kept = cloud.pieces(plane.normal, cloud.lies(plane) & (distance < nearest), config.min_width)[0]
+        plane_of[kept], nearest[kept] = index, distance[kept]
+    planes = Planes(
+        torch.stack([plane.normal for plane in found]) if found else torch.zeros(0, 3),
+        torch.stack([plane.offset for plane in found]) if found else torch.zeros(0),
+    )
+    return _by_area(cloud, planes, plane_of)
+
+
+def _by_area(cloud: Cloud, planes: Planes, plane_of: Tensor) -> tuple[Planes, Tensor, Patches]:
+    """Planes by the area of their patches, without those on which nothing lies."""
+    spots = [cloud.spots[plane_of == index].flatten(0, 1) for index in range(len(planes))]
+    areas = Patches.of(planes, spots).areas
+    order = [index for index in areas.argsort(descending=True, stable=True).tolist() if len(spots[index])]
+    place = torch.full((len(planes) + 1,), -1)
     place[order] = torch.arange(len(order))
-    plane_of = torch.where(plane_of >= 0, place[plane_of.clamp_min(0)], -1)
-    patches = Patches.of(planes, [spots[plane_of[owner] == index] for index in range(len(planes))])
-    return planes, plane_of, patches
-
-
-def _spots(gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-    """Points `[spot, 3]` over the Gaussians' footprints and the Gaussian `[spot]` of each."""
-    axes = matrix_from_quaternion(gaussians.quats)
-    order = gaussians.log_scales.argsort(-1, descending=True)[:, :2]
-    longer = axes.gather(-1, order[:, None].expand(-1, 3, -1))
-    scales = gaussians.scales.gather(-1, order).clamp_max(0.3)
-    spots = footprints(gaussians.means, longer, scales)
-    return spots.flatten(0, 1), torch.arange(len(spots)).repeat_interleave(spots.shape[1])
+    planes = Planes(planes.normals[order], planes.offsets[order])
+    return planes, place[plane_of], Patches.of(planes, [spots[index] for index in order])

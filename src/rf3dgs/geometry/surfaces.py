@@ -94,7 +94,7 @@ def find_surfaces(gaussians: Gaussians, viewpoints: Tensor, config: SurfaceConfi
     tree = KDTree(points.numpy())
     count = min(NEIGHBOURS + 1, len(points))
     neighbours = torch.from_numpy(np.asarray(tree.query(points.numpy(), k=count, workers=-1)[1]).reshape(-1, count))
-    normals = turned_to(smooth_normals(gaussians, neighbours[:, 1:]), points, viewpoints)
+    normals = turned_to(smooth_normals(gaussians, neighbours[:, 1:]), gaussians, viewpoints)
     planes, plane_of, patches = search_planes(gaussians, normals, mass(gaussians), config)
     lies = plane_of >= 0
     along = planes.normals[plane_of[lies]]

@@ -1,18 +1,23 @@
 """The Gaussians as obstacles: how much of a straight segment's power they let through, for any number of segments.
 
-What passes is defined in `splats.transmittance`.
+What passes is defined in `splats.transmittance`. In the native core the Gaussians stand in a tree, built at the first
+question and kept; without the core the specification itself answers.
 """
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from rf3dgs.core.errors import InputError
+from rf3dgs.core.native import native_core, thread_count
 from rf3dgs.splats.transmittance import segment_transmittance
 
 SOFT_RADIUS = 0.05  # m
+LARGEST_LABEL = 2**31 - 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +45,11 @@ class Obstacles:
             if got != shape:
                 text = ", ".join(("gaussian", *(str(size) for size in shape[1:])))
                 raise InputError(f"{name} must be [{text}] for {count} Gaussians; got {list(got)}. Reshape it")
+        if self.labels is not None and len(self.labels) and int(self.labels.max()) > LARGEST_LABEL:
+            raise InputError(f"labels must be at most {LARGEST_LABEL}; got {int(self.labels.max())}. Number them anew")
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in self.__dict__.items() if name != "_tree"}
 
     def transmittance(
         self,
@@ -57,15 +67,22 @@ class Obstacles:
         nothing.
         """
         start, end = _segments(start, end)
-        skips = [self._skip(skip, len(start), name) for skip, name in ((skip_start, "start"), (skip_end, "end"))]
-        return segment_transmittance(
-            *(self.means, self.quats, self.scales, self.opacities, start, end),
-            labels=self.labels,
-            skip_start=skips[0],
-            skip_end=skips[1],
-            stop_short=stop_short,
-            min_opacity=self.min_opacity,
-        )
+        if not 0 <= stop_short < math.inf:
+            raise InputError(f"stop_short must be a length in metres, 0 or more; got {stop_short}")
+        first, last = (self._skip(skip, len(start), name) for skip, name in ((skip_start, "start"), (skip_end, "end")))
+        if self._tree is None:
+            return segment_transmittance(
+                *(self.means, self.quats, self.scales, self.opacities, start, end),
+                labels=self.labels,
+                skip_start=first,
+                skip_end=last,
+                stop_short=stop_short,
+                min_opacity=self.min_opacity,
+            )
+        passed = torch.empty(len(start))
+        skips = (None if skip is None else skip.clamp(-1, LARGEST_LABEL + 1).int().numpy() for skip in (first, last))
+        self._tree.transmittance(_floats(start), _floats(end), *skips, stop_short, passed.numpy(), thread_count())
+        return passed
 
     def soft(
         self,
@@ -88,6 +105,16 @@ class Obstacles:
                 start + shift, end + shift, skip_start=skip_start, skip_end=skip_end, stop_short=stop_short
             )
         return total / 7
+
+    @cached_property
+    def _tree(self) -> Any:
+        """The Gaussians in the native core's tree, or None without the core."""
+        core = native_core()
+        if core is None:
+            return None
+        labels = None if self.labels is None else self.labels.clamp_min(-1).int().contiguous().numpy()
+        shape = (_floats(tensor) for tensor in (self.means, self.quats, self.scales, self.opacities))
+        return core.Obstacles(*shape, labels, self.min_opacity)
 
     def _skip(self, skip: Tensor | None, count: int, end: str) -> Tensor | None:
         if skip is None:
@@ -116,6 +143,10 @@ def visibility_of(
     if means.shape != normals.shape:
         raise InputError(f"normals must be {list(means.shape)} as the means; got {list(normals.shape)}")
     return obstacles.transmittance(means + lift * normals, tx.reshape(1, 3).expand_as(means), skip_start=labels)
+
+
+def _floats(tensor: Tensor) -> Any:
+    return tensor.detach().to("cpu", torch.float32).contiguous().numpy()
 
 
 def _segments(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:

@@ -44,6 +44,31 @@ def sample_mesh(
     the spacing). `colours` `[face, channel]` in 0..1 become the degree-0 harmonics, mid-grey without them; higher
     ones are zero. The same `seed` gives the same Gaussians.
     """
+    return sample_faces(
+        *(vertices, faces),
+        count=count,
+        spacing=spacing,
+        seed=seed,
+        colours=colours,
+        opacity=opacity,
+        thickness=thickness,
+        degree=degree,
+    )[0]
+
+
+def sample_faces(
+    vertices: Tensor,
+    faces: Tensor,
+    *,
+    count: int | None = None,
+    spacing: float | None = None,
+    seed: int = 0,
+    colours: Tensor | None = None,
+    opacity: float = 0.98,
+    thickness: float = 0.007,
+    degree: int = 0,
+) -> tuple[Gaussians, Tensor]:
+    """What `sample_mesh` makes, and the face `[gaussian]` on which each Gaussian lies."""
     vertices = torch.as_tensor(vertices, dtype=torch.float64)
     faces = torch.as_tensor(faces, dtype=torch.long)
     if vertices.dim() != 2 or vertices.shape[1] != 3 or not bool(torch.isfinite(vertices).all()):
@@ -88,7 +113,8 @@ def sample_mesh(
     sh = torch.zeros(len(means), coefficient_count(degree), shade.shape[1])
     sh[:, 0] = (shade[real[face]] - 0.5) / C0
     logit = math.log(opacity / (1 - opacity))
-    return Gaussians(means, quaternion_from_matrix(axes), scales.log(), torch.full((len(means),), logit), sh)
+    gaussians = Gaussians(means, quaternion_from_matrix(axes), scales.log(), torch.full((len(means),), logit), sh)
+    return gaussians, real[face]
 
 
 def normals(gaussians: Gaussians) -> Tensor:

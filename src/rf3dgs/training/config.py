@@ -205,9 +205,9 @@ class SourceConfig:
     """Whether mirrors that the geometry lacks are found where secondary peaks of the spectra meet."""
     refine: bool = True
     """Whether planes are moved, within what geometry allows, to where the peaks of their images are."""
-    plane_error: float = 0.02
+    plane_error: float = 0.05
     """How far a plane of the geometry may lie off [m], one standard deviation."""
-    plane_error_deg: float = 0.5
+    plane_error_deg: float = 1.0
     """How far it may be turned [deg], one standard deviation."""
     least_db: float = 40.0
     """Sources that stay so many dB under the strongest part of the spectrum everywhere are left out."""

@@ -75,8 +75,7 @@ def fit_radio(
     if config.line_of_sight == "source":
         with_mirrors = config.mirror_order > 0
         surfaces = find_surfaces(geometry, spectra.pose.position) if with_mirrors else None
-        labels = None if surfaces is None else surfaces.plane_of
-        obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, geometry.opacities, labels)
+        obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, geometry.opacities)
         mirrors = SourceConfig(order=config.mirror_order, seed=config.seed)
         found = fit_sources(spectra, surfaces, obstacles, where, mirrors)
     span = PaperEncoding.of(spectra).delay_span if config.encoding == "paper" and spectra.delay is not None else 1e-7

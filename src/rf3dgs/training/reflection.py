@@ -20,9 +20,9 @@ COMMON = (10.0, 10.0, 10.0)  # dB by which a, b and c of one plane may differ fr
 LOOSE = (30.0, 30.0, 30.0)  # and the common ones from DIELECTRIC
 DIELECTRIC = (-6.0, -6.0, 0.0)
 WIDTHS = (0.3, 0.5, 0.8)  # of marks [m]
-LEAST_MARKS = 8
+LEAST_MARKS = 6
 DOUBTFUL_DB = 6.0
-WORTH_DB = 0.2
+WORTH_DB = 0.4
 MOST_DB = 25.0
 SILENT_SHARE, SILENT_LEAST = 0.3, 3
 
@@ -154,25 +154,29 @@ def fit_reflection(found: Glints, count: int) -> Tensor:
 
 
 def fit_marks(found: Glints, reflection: Tensor) -> Marks | None:
-    """Where planes reflect otherwise than `reflection` `[P, 3]` says, or None where that predicts no better.
+    """Where planes reflect otherwise than `reflection` `[P, 3]` says, or None where that predicts no plane better.
 
     Every isolated peak marks the place of its reflection with what it deviates, but for deep losses that hardly stand
-    over their surroundings. The width is the one that predicts each mark best from the others.
+    over their surroundings. A plane has marks if each is told better by the others of the plane than by none; the
+    width is the one that tells them best.
     """
     design = torch.stack((torch.ones_like(found.cosine), found.cosine, found.cosine**2), -1)
     predicted = (design * reflection[found.plane].double()).sum(-1).clamp_max(0.0)
     miss = found.level_db - predicted
     doubtful = (miss < -DOUBTFUL_DB) & (found.level_db < found.limit_db + DOUBTFUL_DB)
     use = found.alone & found.seen & ~doubtful
-    if int(use.sum()) < LEAST_MARKS:
-        return None
     points, plane, level_db = found.point[use], found.plane[use], miss[use].clamp(-MOST_DB, MOST_DB).float()
-    best, least = None, float(level_db.abs().mean())
+    best, most = None, 0.0
     for width in WIDTHS:
         marks = Marks(points, plane, level_db, width)
-        error = float((level_db - marks.at(points, plane, leave_out=True)).abs().mean())
-        if error < least - WORTH_DB:
-            best, least = marks, error
+        gained = level_db.abs() - (level_db - marks.at(points, plane, leave_out=True)).abs()
+        count = torch.bincount(plane, minlength=len(reflection))
+        mean = torch.zeros(len(reflection)).index_add_(0, plane, gained) / count.clamp_min(1)
+        worth = (count >= LEAST_MARKS) & (mean > WORTH_DB)
+        total = float((mean * count)[worth].sum())
+        if total > most:
+            kept = worth[plane]
+            best, most = Marks(points[kept], plane[kept], level_db[kept], width), total
     return best
 
 

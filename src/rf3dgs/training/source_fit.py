@@ -13,6 +13,7 @@ from rf3dgs.geometry import Surfaces
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
+from rf3dgs.training.consolidation import consolidated, with_skins
 from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
 from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_marks, fit_reflection, glints, silent_planes
 from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, refined_planes, with_mirrors
@@ -47,7 +48,8 @@ def fit_sources(
 ) -> SourceFit:
     """The transmitter at `tx` and its images in the planes of `surfaces`, fitted to `spectra` `[position, row, col]`.
 
-    Without `surfaces` there is the line of sight alone. `obstacles` are labelled by `surfaces.plane_of`.
+    Without `surfaces` there is the line of sight alone. Their pieces of large planes are made one, and mirrors that
+    they lack are added; the result says which Gaussians of `obstacles` belong to which plane.
     """
     config = SourceConfig() if config is None else config
     if not 0 <= config.order <= HIGHEST_ORDER:
@@ -59,6 +61,8 @@ def fit_sources(
     if surfaces is None or config.order == 0 or not len(surfaces.planes):
         return SourceFit(direct, seen, direct.rays_each(positions, obstacles, in_sight=seen))
     probes = torch.cat((positions, _probes(positions, config.seed)))
+    surfaces = consolidated(surfaces, obstacles.means)
+    obstacles = replace(obstacles, labels=surfaces.plane_of)
     sources = _known(direct, surfaces)
     sources = with_images(sources, probes, replace(config, order=1))
     peaks = peaks_of(spectra) if config.refine or config.complete else None
@@ -69,7 +73,11 @@ def fit_sources(
         every = with_images(every, probes, config)
         mirrors = find_mirrors(every, every.rays_each(positions, obstacles, in_sight=seen), peaks, spectra, obstacles)
         if mirrors:
-            sources = completed(sources, *with_mirrors(sources, mirrors)[:2])
+            sources = completed(sources, *with_mirrors(sources, mirrors))
+            assert sources.patches is not None
+            surfaces = replace(surfaces, planes=sources.planes, patches=sources.patches)
+            surfaces = replace(surfaces, plane_of=with_skins(surfaces, obstacles.means))
+            obstacles = replace(obstacles, labels=surfaces.plane_of)
             sources = with_images(sources, probes, replace(config, order=1))
             sources = _refined(sources, seen, peaks, positions, obstacles, config)
     rays = sources.rays_each(positions, obstacles, in_sight=seen)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.angles import angle_between
-from rf3dgs.field.images import mirrored
+from rf3dgs.field.images import image_chain, mirrored, sequences
 from rf3dgs.field.sources import PointSources, Rays
 from rf3dgs.field.transmitter import bearing_error, closest_point, pairwise_meetings, pixel_of
 from rf3dgs.geometry import Patches, Planes
@@ -20,6 +20,7 @@ from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
+from rf3dgs.training.consolidation import LARGE, surface_points
 from rf3dgs.training.line_of_sight import SEEN_OVER_RING, standing_out
 
 PEAKS = 16
@@ -30,8 +31,9 @@ STEPS = 6
 LEAST_SUPPORT, LEAST_SHARE = 5, 0.1
 MOST_FOUND = 12
 SAME_ANGLE, SAME_DISTANCE = math.cos(math.radians(5.0)), 0.2
+SAME_BEARING = math.radians(2.5)
 SPOT = 0.3
-DISC = 4  # cells of surface around a reflection that was seen
+DISC = (0.4, 1.5)  # m of surface around a reflection that was seen, at least and at most
 NEAREST_IMAGE = 0.3
 
 
@@ -127,11 +129,16 @@ def _moved(
 
 @dataclass(frozen=True, eq=False)
 class Mirror:
-    """A plane that peaks imply: normal `[3]`, offset [m], where it was seen to reflect `[n, 3]` [m]."""
+    """A plane that peaks imply: normal `[3]`, offset [m], where it was seen to reflect `[n, 3]` [m].
+
+    image `[3]` is the point in which the bearings from receivers `[m, 3]` meet.
+    """
 
     normal: Tensor
     offset: Tensor
     points: Tensor
+    image: Tensor
+    receivers: Tensor
 
 
 def find_mirrors(
@@ -163,7 +170,26 @@ def find_mirrors(
         if mirror is not None:
             mirrors.append(mirror)
         rest = rest.only(~chosen)
-    return mirrors
+    return _of_one_reflection(mirrors, sources)
+
+
+def _of_one_reflection(mirrors: list[Mirror], sources: PointSources) -> list[Mirror]:
+    """The mirrors whose images are not images of images in the others and the large planes; weak ones go first."""
+    kept = list(mirrors)
+    large = torch.zeros(0, dtype=torch.bool) if sources.patches is None else sources.patches.areas >= LARGE
+    for mirror in reversed(mirrors):
+        others = [one for one in kept if one is not mirror]
+        normals = torch.cat((sources.planes.normals[large], *(one.normal[None] for one in others)))
+        offsets = torch.cat((sources.planes.offsets[large], *(one.offset[None] for one in others)))
+        rows = sequences(len(offsets), 2)
+        rows = rows[rows[:, 1] >= 0]
+        if not len(rows):
+            continue
+        images = image_chain(sources.tx, normals, offsets, rows)[:, -1]
+        towards = angle_between((images[:, None] - mirror.receivers), (mirror.image - mirror.receivers)[None])
+        if float(towards.median(-1).values.min()) < SAME_BEARING:
+            kept = others
+    return kept
 
 
 def _meeting(origin: Tensor, bearing: Tensor, position: Tensor, limit: float) -> tuple[Tensor, Tensor]:
@@ -206,18 +232,17 @@ def _implied(image: Tensor, tx: Tensor, receivers: Tensor, obstacles: Obstacles)
     good = height > 0
     share = height[good] / (height[good] + (tx @ normal - offset))
     points = receivers[good] + share[:, None] * (image - receivers[good])
-    return Mirror(normal, offset, points)
+    return Mirror(normal, offset, points, image, receivers[good])
 
 
-def with_mirrors(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, Patches, int]:
-    """Planes and patches completed by mirrors, and how many planes are new.
+def with_mirrors(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, Patches]:
+    """Planes and patches completed by mirrors.
 
     A mirror that lies in a known plane gives it surface where it was seen to reflect; any other is a new plane.
     """
     assert sources.patches is not None
     normals, offsets = list(sources.planes.normals), list(sources.planes.offsets)
     points = [surface_points(sources.planes, sources.patches, plane) for plane in range(len(sources.planes))]
-    known = len(points)
     for mirror in mirrors:
         middle = mirror.points.mean(0)
         for plane, (normal, offset) in enumerate(zip(normals, offsets, strict=True)):
@@ -232,25 +257,23 @@ def with_mirrors(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, 
             points.append(torch.zeros(0, 3))
         points[place] = torch.cat((points[place], _discs(mirror)))
     planes = Planes(torch.stack(normals), torch.stack(offsets))
-    return planes, Patches.of(planes, points), len(points) - known
-
-
-def surface_points(planes: Planes, patches: Patches, plane: int) -> Tensor:
-    """The middles `[n, 3]` [m] of the cells of one plane that are surface."""
-    cell = torch.nonzero(patches.grid(plane))
-    local = patches.low[plane] + (cell + 0.5) * CELL
-    return local @ patches.axes[plane] + planes.offsets[plane] * planes.normals[plane]
+    return planes, Patches.of(planes, points)
 
 
 def _discs(mirror: Mirror) -> Tensor:
-    """Points `[n, 3]` all over discs of surface around where a mirror was seen to reflect."""
+    """Points `[n, 3]` all over discs of surface around where a mirror was seen to reflect.
+
+    Discs reach as far as the third nearest such place, so that sparse observations still close to one surface.
+    """
     lean = torch.linalg.cross(mirror.normal, torch.eye(3)[mirror.normal.abs().argmin()])
     lean = lean / torch.linalg.vector_norm(lean)
     axes = torch.stack((lean, torch.linalg.cross(mirror.normal, lean)))
-    steps = torch.arange(-DISC, DISC + 1.0)
+    apart = torch.cdist(mirror.points, mirror.points).sort(-1).values
+    reach = apart[:, min(3, len(apart) - 1)].clamp(*DISC)
+    steps = torch.arange(-round(DISC[1] / CELL), round(DISC[1] / CELL) + 1.0) * CELL
     spots = torch.cartesian_prod(steps, steps)
-    spots = spots[spots.norm(dim=-1) <= DISC + 0.5] * CELL
-    return (mirror.points[:, None] + spots @ axes).reshape(-1, 3)
+    inside = spots.norm(dim=-1) <= reach[:, None]
+    return (mirror.points[:, None] + spots @ axes)[inside]
 
 
 def completed(sources: PointSources, planes: Planes, patches: Patches) -> PointSources:

@@ -1,0 +1,70 @@
+"""Large planes made whole: photographs leave walls in pieces that lie a little beside each other.
+
+For mirrors a wall is one plane, and none of the Gaussians that stand for it may stand in the way of its own reflection.
+"""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from rf3dgs.geometry import Patches, Planes, Surfaces
+from rf3dgs.geometry.patches import CELL
+
+LARGE = 5.0  # m^2
+PIECE_ANGLE = 0.985  # cosine of 10 degrees
+PIECE_DISTANCE = 0.25  # m
+SKIN, SKIN_ANGLE = 0.30, 0.7  # m, cosine of 45 degrees
+
+
+def surface_points(planes: Planes, patches: Patches, plane: int) -> Tensor:
+    """The middles `[n, 3]` [m] of the cells of one plane that are surface."""
+    cell = torch.nonzero(patches.grid(plane))
+    local = patches.low[plane] + (cell + 0.5) * CELL
+    return local @ patches.axes[plane] + planes.offsets[plane] * planes.normals[plane]
+
+
+def consolidated(surfaces: Surfaces, means: Tensor) -> Surfaces:
+    """The surfaces with pieces that lie on or near a large plane, within 25 cm and 10 degrees, made parts of it.
+
+    Planes keep their numbers; one that became a part has no surface of its own any more. `means` `[N, 3]` [m] are the
+    Gaussians'.
+    """
+    planes, patches = surfaces.planes, surfaces.patches
+    points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
+    areas, whole = patches.areas, torch.arange(len(planes))
+    for large in areas.argsort(descending=True, stable=True).tolist():
+        if float(areas[large]) < LARGE or int(whole[large]) != large:
+            continue
+        normal, offset = planes.normals[large], planes.offsets[large]
+        for piece in range(len(planes)):
+            if piece == large or int(whole[piece]) != piece or float(areas[piece]) >= float(areas[large]):
+                continue
+            if abs(float(planes.normals[piece] @ normal)) < PIECE_ANGLE or not len(points[piece]):
+                continue
+            height = points[piece] @ normal - offset
+            if float(height.abs().median()) < PIECE_DISTANCE:
+                points[large] = torch.cat((points[large], points[piece] - height[:, None] * normal))
+                points[piece], whole[piece] = points[piece][:0], large
+    plane_of = torch.where(surfaces.plane_of >= 0, whole[surfaces.plane_of.clamp_min(0)], -1)
+    joined = replace(surfaces, patches=Patches.of(planes, points), plane_of=plane_of)
+    return replace(joined, plane_of=with_skins(joined, means))
+
+
+def with_skins(surfaces: Surfaces, means: Tensor) -> Tensor:
+    """Labels `[N]` of the Gaussians at `means` `[N, 3]` [m]: those near a large plane and along it, too, are its own.
+
+    Near is within 30 cm and 45 degrees, before or behind its surface.
+    """
+    labels = surfaces.plane_of.clone()
+    areas = surfaces.patches.areas
+    for plane in areas.argsort(descending=True, stable=True).tolist():
+        if float(areas[plane]) < LARGE:
+            break
+        normal = surfaces.planes.normals[plane]
+        height = (means @ normal - surfaces.planes.offsets[plane]).abs()
+        skin = (labels < 0) & (height < SKIN) & ((surfaces.normals @ normal).abs() > SKIN_ANGLE)
+        near = torch.nonzero(skin).squeeze(-1)
+        held = surfaces.patches.holds(means[near], torch.full_like(near, plane))
+        labels[near[held]] = plane
+    return labels
