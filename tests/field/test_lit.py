@@ -155,7 +155,9 @@ def test_delay_of_a_lit_wall_is_that_of_the_single_bounce():
     seen = (grid.directions[..., 2] < -0.5) & (hit[..., :2].abs() < 2.5).all(-1)
     length = (hit - TX).norm(dim=-1) + (hit - here.position).norm(dim=-1)
     assert shown.delay is not None
-    assert float((shown.delay - length / SPEED_OF_LIGHT)[seen].abs().mean()) < 0.1e-9  # 3 cm
+    assert (
+        float((shown.delay - length / SPEED_OF_LIGHT)[seen].abs().mean()) < 0.15e-9
+    )  # of Gaussians that overlap the nearer win: 4 cm
     assert shown.aod is not None
     straight = torch.nn.functional.normalize(hit - TX, dim=-1)
     cosine = (shown.aod * straight).sum(-1)[seen]

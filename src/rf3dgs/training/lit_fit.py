@@ -25,6 +25,7 @@ LAW_SPREAD = torch.tensor([5.0, 1.0, 3.0, 5.0, 1.0])
 LAW_LOW = torch.tensor([-300.0, -6.0, 0.0, -300.0, -6.0])
 LAW_HIGH = torch.tensor([100.0, 6.0, 60.0, 100.0, 6.0])
 STEPS = 12
+AMBIENT_ROUNDS = 3
 DARK = 1e-4  # visibility below which nothing arrives straight
 DB = 10 / 2.302585092994046
 MOST = 400_000
@@ -218,17 +219,21 @@ def fit_ambient(scattering: Scattering, seen: Observations, laws: Tensor, ridge:
     own = seen.csi.clone()
     own[:, 0] -= late / (SPEED_OF_LIGHT * NANOSECOND)
     straight = start[g]
-    # own = (1 - share) straight + share ambient: the excess of the ambient over the straight way, by least squares.
     weight = _worth(seen.weight)
-    left_over = own - straight
+    groups = (scattering.segment_of, scattering.cell_of, torch.arange(count))
     total = torch.zeros(count, 4)
-    for group in (scattering.segment_of, scattering.cell_of, torch.arange(count)):
-        number, groups = group[g], int(group.max()) + 1
-        left = torch.zeros(groups).index_add_(0, number, weight * share * share)
-        right = torch.zeros(groups, 4).index_add_(0, number, (weight * share)[:, None] * left_over)
-        found = right / (left + ridge)[:, None]
-        left_over = left_over - share[:, None] * found[number]
-        total += found[group]
+    for _ in range(AMBIENT_ROUNDS):
+        # An observed departure is a unit vector; the model's is shorter where its parts disagree.
+        blended = straight[:, 1:] + share[:, None] * total[g, 1:]
+        target = torch.cat((own[:, :1], own[:, 1:] * torch.linalg.vector_norm(blended, dim=-1, keepdim=True)), -1)
+        left_over = target - straight - share[:, None] * total[g]
+        for group in groups:
+            number, size = group[g], int(group.max()) + 1
+            left = torch.zeros(size).index_add_(0, number, weight * share * share)
+            right = torch.zeros(size, 4).index_add_(0, number, (weight * share)[:, None] * left_over)
+            found = right / (left + ridge)[:, None]
+            left_over = left_over - share[:, None] * found[number]
+            total += found[group]
     return start + total
 
 
