@@ -110,7 +110,7 @@ def observe(geometry: Gaussians, views: Sequence[LitView], *, unit: float, backe
             (sums,) = torch.autograd.grad(raster.values, values, target)
         chosen = ((sums[:, 0] > LEAST_WEIGHT) & (sums[:, 1] > 0)).nonzero().squeeze(-1)
         rows.append((chosen, torch.full_like(chosen, number), sums[chosen]))
-    gaussian, view, sums = (torch.cat(part) for part in zip(*rows, strict=True))
+    gaussian, view, sums = _joined(rows)
     power = sums[:, 1] / sums[:, 0] * unit
     return Observations(
         gaussian=gaussian,
@@ -146,5 +146,11 @@ def shortfall(surface: LitSurface, views: Sequence[LitView], floor_db: float, ba
         sums = sums * sent
         chosen = (sums[:, 0] > LEAST_WEIGHT).nonzero().squeeze(-1)
         rows.append((chosen, torch.full_like(chosen, number), sums[chosen]))
-    gaussian, view, sums = (torch.cat(part) for part in zip(*rows, strict=True))
+    gaussian, view, sums = _joined(rows)
     return Shortfall(gaussian, view, sums[:, 0].contiguous(), sums[:, 1] / sums[:, 0])
+
+
+def _joined(rows: Sequence[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
+    """The rows of all views, one after another."""
+    first, second, third = zip(*rows, strict=True)
+    return torch.cat(first), torch.cat(second), torch.cat(third)
