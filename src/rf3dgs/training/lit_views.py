@@ -102,7 +102,7 @@ def observe(geometry: Gaussians, views: Sequence[LitView], *, unit: float, backe
     columns = 6 if has_csi else 2
     rows = []
     for number, one in enumerate(views):
-        values = torch.zeros(len(geometry), columns, requires_grad=True)
+        values = torch.zeros((len(geometry), columns)).requires_grad_()
         with torch.enable_grad():
             raster = rasterize(*shape, values, one.view, compositing=BLENDING, backend=backend)
             target = (one.channels[..., : columns - 1] / unit).float()
