@@ -97,7 +97,8 @@ def _view(one: Spectrum, rays: Rays | None) -> LitView:
 
 def observe(geometry: Gaussians, views: Sequence[LitView], *, unit: float, backend: Backend = "auto") -> Observations:
     """What `views` tell about every Gaussian of `geometry`; `unit`: the power that counts as 1 on the way."""
-    shape = tuple(tensor.detach() for tensor in (geometry.means, geometry.quats, geometry.scales, geometry.opacities))
+    geometry = geometry.detach()
+    shape = (geometry.means, geometry.quats, geometry.scales, geometry.opacities)
     has_csi = all(view.channels.shape[-1] == 5 for view in views)
     columns = 6 if has_csi else 2
     rows = []
