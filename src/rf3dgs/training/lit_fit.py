@@ -164,15 +164,21 @@ RIDGE = Ridge()
 
 
 def refine_residual(
-    surface: LitSurface, views: Sequence[LitView], *, passes: int, ridge: Ridge = RIDGE, backend: Backend = "auto"
+    surface: LitSurface,
+    views: Sequence[LitView],
+    *,
+    passes: int,
+    floor_db: float,
+    ridge: Ridge = RIDGE,
+    backend: Backend = "auto",
 ) -> LitSurface:
     """The surface with the residual that makes up for what it lacks in `views`, in so many passes.
 
     Each pass renders the views, throws their errors in dB back onto the Gaussians, and solves for what is lacking from
-    coarse to fine: harmonics of segments, harmonics of cells, levels.
+    coarse to fine: harmonics of segments, harmonics of cells, levels. Levels under `floor_db` count as that.
     """
     for _ in range(passes):
-        lacking = shortfall(surface, views, surface.window.floor_db, backend)
+        lacking = shortfall(surface, views, floor_db, backend)
         surface = _corrected(surface, views, lacking, ridge)
     return surface
 

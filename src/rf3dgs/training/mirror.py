@@ -4,6 +4,8 @@ Closed form throughout: surfaces of the geometry, point sources (the transmitter
 surface part on what the point sources leave over. The same spectra and geometry give the same field.
 """
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -23,6 +25,7 @@ from rf3dgs.training.source_fit import fit_sources
 
 CELL = 0.8  # m
 PASSES = 3
+DEEPEST_DB = 90.0  # under the window's ceiling; what is darker is the tail of a beam, or directions that no ray reached
 STAGES = ("surfaces", "point sources", "observations", "laws", "residual")
 
 
@@ -81,6 +84,8 @@ def fit_surface(
     cells = cells_of(geometry.means, surfaces.segment_of)
     scattering = Scattering.of(geometry.means, surfaces.normals, visibility, surfaces.segment_of, cells, tx)
     seen = observe(geometry, views, unit=10 ** (window.ceil_db / 10), backend=config.backend)
+    floor_db = max(window.floor_db, window.ceil_db - DEEPEST_DB)
+    seen = replace(seen, level_db=seen.level_db.clamp_min(floor_db))
     progress.update(3)
     laws = fit_laws(scattering, seen)
     progress.update(4)
@@ -101,7 +106,7 @@ def fit_surface(
         tx=tx,
         window=window,
     )
-    surface = refine_residual(bare, views, passes=PASSES, backend=config.backend)
+    surface = refine_residual(bare, views, passes=PASSES, floor_db=floor_db, backend=config.backend)
     progress.update(5)
     return surface
 
