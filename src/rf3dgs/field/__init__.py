@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from rf3dgs.core.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from rf3dgs.field.lit import LitSurface as LitSurface
     from rf3dgs.field.radiance import Surface as Surface
     from rf3dgs.field.radio_field import RadioField as RadioField
     from rf3dgs.field.sources import PointSources as PointSources
@@ -14,9 +15,10 @@ if TYPE_CHECKING:
 _HOMES = {
     "RadioField": ".radio_field",
     "Surface": ".radiance",
+    "LitSurface": ".lit",
     "PointSources": ".sources",
     "Rays": ".sources",
     "estimate_transmitter": ".transmitter",
 }
-__all__ = ["RadioField", "Surface", "PointSources", "Rays", "estimate_transmitter"]  # noqa: RUF022 (reading order)
+__all__ = ["RadioField", "Surface", "LitSurface", "PointSources", "Rays", "estimate_transmitter"]  # noqa: RUF022 (reading order)
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -23,9 +23,9 @@ from rf3dgs.core.errors import DataError, InputError, RfError
 from rf3dgs.core.files import atomic_folder
 from rf3dgs.core.frames import Pose
 from rf3dgs.data.safe import read_bytes, read_json
-from rf3dgs.field.radiance import CSI_CHANNELS, CSI_DEGREE, Surface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.field.source_files import source_record, source_tensors, sources_of
+from rf3dgs.field.surface_files import surface_kinds, surface_of, surface_record, surface_tensors
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Instrument
 
@@ -39,6 +39,7 @@ CONVENTIONS = {
     "device": "x forward, y left, z up",
     "quaternions": "wxyz, world_from_device",
     "gain": "window value 0.5 + SH(direction from receiver to Gaussian), 3DGS order and signs",
+    "residual": "mirror model: E in dB, the same harmonics; laws R, b, alpha, A, e per segment",
     "csi": "vector: delay residual [ns], departure residual x, y, z; paper: azimuth, zenith, delay as 0.5 + SH",
 }
 
@@ -94,16 +95,7 @@ def load_field(path: str | Path) -> RadioField:
 
 
 def _tensors(field: RadioField) -> dict[str, Tensor]:
-    surface = field.surface
-    half = {
-        "quats": torch.nn.functional.normalize(surface.quats, dim=-1),
-        "log_scales": surface.log_scales,
-        "logit_opacities": surface.logit_opacities.clamp(-30.0, 30.0),
-        "gain_sh": surface.gain_sh,
-        "csi_sh": surface.csi_sh,
-    }
-    stored = {name: tensor.detach().half().contiguous() for name, tensor in half.items()}
-    stored["means"] = surface.means.detach().contiguous()
+    stored = surface_tensors(field.surface)
     stored["solidity"] = (field.solidity.detach().clamp(0, 1) * 255).round().to(torch.uint8)
     stored["colour"] = field.colour.to(torch.uint8).contiguous()
     if field.plane_of is not None:
@@ -112,16 +104,11 @@ def _tensors(field: RadioField) -> dict[str, Tensor]:
 
 
 def _description(field: RadioField) -> dict[str, Any]:
-    surface = field.surface
     return {
         "schema": SCHEMA,
         "kind": "rf3dgs radio field",
         "conventions": CONVENTIONS,
-        "gaussians": len(surface),
-        "gain_coefficients": surface.gain_sh.shape[1],
-        "encoding": surface.encoding,
-        "delay_span": surface.delay_span,
-        "window_db": [surface.window.floor_db, surface.window.ceil_db],
+        **surface_record(field.surface),
         "frequency": field.frequency,
         "instrument": {
             "name": field.instrument.name,
@@ -129,7 +116,6 @@ def _description(field: RadioField) -> dict[str, Any]:
             "beam_solid_angle": field.instrument.beam_solid_angle,
         },
         "tx": {"position": field.tx.position.tolist(), "orientation": field.tx.orientation.tolist()},
-        "prior_tx": surface.tx.tolist(),
         "bounds": field.bounds.tolist(),
         "sources": source_record(field.sources),
         "labelled": field.plane_of is not None,
@@ -140,17 +126,8 @@ def _description(field: RadioField) -> dict[str, Any]:
 
 def _check(tensors: Mapping[str, Tensor], body: Mapping[str, Any], source: Path) -> None:
     """Refuse tensors that are missing, have another shape or type than the description says, or are not finite."""
-    count, encoding = int(body["gaussians"]), body["encoding"]
-    expected = {
-        "means": ((count, 3), torch.float32),
-        "quats": ((count, 4), torch.float16),
-        "log_scales": ((count, 3), torch.float16),
-        "logit_opacities": ((count,), torch.float16),
-        "gain_sh": ((count, int(body["gain_coefficients"])), torch.float16),
-        "csi_sh": ((count, (CSI_DEGREE[encoding] + 1) ** 2, CSI_CHANNELS[encoding]), torch.float16),
-        "solidity": ((count,), torch.uint8),
-        "colour": ((count, 3), torch.uint8),
-    }
+    count = int(body["gaussians"])
+    expected = surface_kinds(body) | {"solidity": ((count,), torch.uint8), "colour": ((count, 3), torch.uint8)}
     if body.get("labelled", False):
         expected["plane_of"] = ((count,), torch.int16)
     for name, (shape, kind) in expected.items():
@@ -168,18 +145,9 @@ def _check(tensors: Mapping[str, Tensor], body: Mapping[str, Any], source: Path)
 
 def _assemble(tensors: Mapping[str, Tensor], body: Mapping[str, Any]) -> RadioField:
     floor_db, ceil_db = (_number(value, "window_db") for value in body["window_db"])
-    surface = Surface(
-        means=tensors["means"],
-        quats=tensors["quats"].float(),
-        log_scales=tensors["log_scales"].float(),
-        logit_opacities=tensors["logit_opacities"].float(),
-        gain_sh=tensors["gain_sh"].float(),
-        csi_sh=tensors["csi_sh"].float(),
-        tx=_vector(body["prior_tx"], "prior_tx"),
-        window=DbWindow(floor_db, ceil_db),
-        encoding=body["encoding"],
-        delay_span=_number(body["delay_span"], "delay_span"),
-    )
+    span = _number(body.get("delay_span", 0.0), "delay_span")
+    window = DbWindow(floor_db, ceil_db)
+    surface = surface_of(tensors, body, _vector(body["prior_tx"], "prior_tx"), window, span)
     frequency = _number(body["frequency"], "frequency")
     instrument = body["instrument"]
     low, high = (_vector(corner, "bounds") for corner in body["bounds"])

@@ -73,6 +73,14 @@ class Surface:
         """Opacities `[N]` in 0..1."""
         return torch.sigmoid(self.logit_opacities)
 
+    def picture(self, view: View, *, csi: bool = True, backend: Backend = "auto") -> Tensor:
+        """The channels of a view; see `picture_of`."""
+        return picture_of(self, view, csi=csi, backend=backend)
+
+    def radiance(self, channels: Tensor, receiver: Tensor) -> "Radiance":
+        """Physical values of composited channels; see `decode`."""
+        return decode(channels, self, receiver)
+
     @classmethod
     def bare(
         cls,

@@ -18,7 +18,8 @@ from rf3dgs.core.angles import angles_of
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid, sample_grid, view_of
-from rf3dgs.field.radiance import Radiance, Surface, decode, picture_of
+from rf3dgs.field.lit import LitSurface
+from rf3dgs.field.radiance import Radiance, Surface
 from rf3dgs.field.sources import PointSources, Rays
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.peaks import find_peaks
@@ -31,15 +32,16 @@ from rf3dgs.splats.rasterize import Backend
 class RadioField:
     """A radio radiance field of one transmitter at one frequency.
 
-    surface: the Gaussians that scatter. solidity `[N]`: their opacity to rays as the geometry has it, 0..1, which
-    decides what hides a point source. sources: the point sources, the line of sight first, or None.
+    surface: the Gaussians that scatter, by the mirror model's laws (`LitSurface`) or the paper's harmonics (`Surface`).
+    solidity `[N]`: their opacity to rays as the geometry has it, 0..1, which decides what hides a point source.
+    sources: the point sources, the line of sight first, or None.
     plane_of `[N]`: the plane of the sources that a Gaussian belongs to, -1 for none; None when there are no planes.
     frequency [Hz]; instrument: what its training spectra were taken with, and so what it renders.
     tx: the transmitter's pose, given or estimated. bounds `[2, 3]`: low and high corner of the training positions [m].
     colour `[N, 3]` uint8: how a viewer paints the Gaussians. meta: free text about the run (seed, versions, steps).
     """
 
-    surface: Surface
+    surface: Surface | LitSurface
     sources: PointSources | None
     solidity: Tensor
     frequency: float
@@ -53,7 +55,7 @@ class RadioField:
 
     @property
     def window(self) -> DbWindow:
-        """The dB window in which the surface was trained, and in which pictures of this field are drawn."""
+        """The dB window in which pictures of this field are drawn; the paper's surface was trained in it, too."""
         return self.surface.window
 
     @cached_property
@@ -147,17 +149,17 @@ class RadioField:
         return load_field(path)
 
     def _render_one(self, pose: Pose, grid: DirectionGrid, csi: bool) -> Radiance:
-        surface = decode(self._channels(pose, grid, csi), self.surface, pose.position)
+        surface = self.surface.radiance(self._channels(pose, grid, csi), pose.position)
         if self.sources is None:
             return surface
         return with_rays(surface, self.sources.rays(pose.position, self.obstacles), pose, grid, self.instrument)
 
     def _channels(self, pose: Pose, grid: DirectionGrid, csi: bool) -> Tensor:
         if grid.kind != "list":
-            return picture_of(self.surface, view_of(pose, grid), csi=csi, backend=self.backend)
+            return self.surface.picture(view_of(pose, grid), csi=csi, backend=self.backend)
         rows = max(8, math.ceil(2 * math.pi / self.instrument.lobe))
         sphere = equirect_grid(2 * rows, rows)
-        picture = picture_of(self.surface, view_of(pose, sphere), csi=csi, backend=self.backend)
+        picture = self.surface.picture(view_of(pose, sphere), csi=csi, backend=self.backend)
         return sample_grid(picture, sphere, grid.directions)
 
     def _paths_of_one(self, pose: Pose, strongest: int, with_peaks: bool) -> Tensor:

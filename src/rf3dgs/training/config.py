@@ -8,8 +8,15 @@ from rf3dgs.core.errors import InputError
 
 @dataclass(frozen=True)
 class RadioConfig:
-    """The radio stage: opacity and CSI-encoded harmonics on frozen geometry."""
+    """The radio stage: spectra on frozen geometry.
 
+    The settings from `encoding` to `train_opacity` belong to the paper's model, as `steps` and `csi_every` do; the
+    mirror model is fitted in closed form and has none of them.
+    """
+
+    model: Literal["mirror", "paper"] = "paper"
+    """"mirror": the transmitter's mirror images as point sources, and surfaces that scatter by laws of their own;
+    "paper": harmonics in a dB window on every Gaussian, the line of sight as a point source."""
     steps: int = 1000
     """Iterations; each takes the picture of one training position, a whole sphere or a pinhole's."""
     csi_every: int = 2

@@ -27,6 +27,7 @@ from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.checkpoint import fingerprint
 from rf3dgs.training.config import RadioConfig, SourceConfig
 from rf3dgs.training.loop import train
+from rf3dgs.training.mirror import fit_mirror
 from rf3dgs.training.radio_stage import RadioStage
 from rf3dgs.training.radio_views import radio_views
 from rf3dgs.training.source_fit import fit_sources
@@ -61,6 +62,15 @@ def fit_radio(
     estimated = where is None
     where = estimate_transmitter(spectra) if where is None else where
     window = _window(spectra, config)
+    meta: dict[str, str | int | float | bool] = {
+        "model": config.model,
+        "seed": config.seed,
+        "positions": len(spectra),
+        "transmitter": "estimated" if estimated else "given",
+        "Gaussians given": given,
+    }
+    if config.model == "mirror":
+        return fit_mirror(geometry, spectra, config, where, window, _colour(geometry), meta, progress)
     found = None
     if config.line_of_sight == "source":
         with_mirrors = config.mirror_order > 0
@@ -103,14 +113,7 @@ def fit_radio(
         checkpoint_dir=checkpoint_dir,
         every_steps=config.checkpoint_every,
     )
-    meta = {
-        "steps": config.steps,
-        "seed": config.seed,
-        "positions": len(spectra),
-        "transmitter": "estimated" if estimated else "given",
-        "positions in sight": 0 if found is None else int(found.seen.sum()),
-        "Gaussians given": given,
-    }
+    meta |= {"steps": config.steps, "positions in sight": 0 if found is None else int(found.seen.sum())}
     return RadioField(
         surface=stage.surface(),
         sources=None if found is None else found.sources,

@@ -1,0 +1,257 @@
+"""The surface part of the mirror model in closed form: laws of segments, then a residual from coarse to fine.
+
+The laws R, b, alpha, A, e of all segments are found together by Gauss-Newton steps on a soft-L1 loss in dB, first one
+law for everything, then each segment's own, drawn to the common one as if that had been seen in `SHRINK` pixels. What
+remains is a linear problem in dB: harmonics of segments and cells and a level for each Gaussian, by ridge regression.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from rf3dgs.core.units import SPEED_OF_LIGHT
+from rf3dgs.field.lit import AMBIENT_DISTANCE, HARMONICS, LARGEST_RESIDUAL_DB, LitSurface, incidence
+from rf3dgs.field.radiance import NANOSECOND, bounce
+from rf3dgs.splats.harmonics import C0, basis, view_directions
+from rf3dgs.splats.rasterize import Backend
+from rf3dgs.training.lit_views import LitView, Observations, Shortfall, shortfall
+
+SOFT_DB = 3.0  # where soft-L1 turns from squares to absolute values
+SHRINK = 30.0  # [pixel]
+LAW_SPREAD = torch.tensor([5.0, 1.0, 3.0, 5.0, 1.0])
+"""How far a segment's law usually is from the common one: the unit in which it is drawn to it."""
+LAW_LOW = torch.tensor([-300.0, -6.0, 0.0, -300.0, -6.0])
+LAW_HIGH = torch.tensor([100.0, 6.0, 60.0, 100.0, 6.0])
+STEPS = 12
+AMBIENT_ROUNDS = 3
+DARK = 1e-4  # visibility below which nothing arrives straight
+DB = 10 / 2.302585092994046
+MOST = 400_000
+ROWS_AT_ONCE = 50_000
+BAND = torch.tensor([degree for degree in range(4) for _ in range(2 * degree + 1)], dtype=torch.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Scattering:
+    """The geometry of scattering: distance d `[N]` [m], cos_i `[N]`, mirrored directions `[N, 3]`, visibility `[N]`,
+    and the numbers of segments and cells `[N]`."""
+
+    means: Tensor
+    normals: Tensor
+    distance: Tensor
+    cosine: Tensor
+    mirrored: Tensor
+    visibility: Tensor
+    segment_of: Tensor
+    cell_of: Tensor
+    tx: Tensor
+
+    @classmethod
+    def of(
+        cls, means: Tensor, normals: Tensor, visibility: Tensor, segment_of: Tensor, cell_of: Tensor, tx: Tensor
+    ) -> "Scattering":
+        """The geometry of Gaussians at `means` with unit `normals` `[N, 3]` under a transmitter at `tx` `[3]` [m]."""
+        distance, cosine, mirrored = incidence(means, normals, tx)
+        return cls(means, normals, distance, cosine, mirrored, visibility, segment_of, cell_of, tx)
+
+
+def fit_laws(scattering: Scattering, seen: Observations) -> Tensor:
+    """The laws `[S, 5]` of all segments."""
+    chosen = _some(len(seen), MOST)
+    g, weight = seen.gaussian[chosen], _worth(seen.weight[chosen])
+    level = seen.level_db[chosen]
+    along = view_directions(scattering.means[g] - seen.receivers[seen.view[chosen]], torch.zeros(3))
+    known = _known(scattering, g, along)
+    segment = scattering.segment_of[g]
+    everyone = torch.zeros_like(segment)
+    lit = scattering.visibility[g] > 0.5
+    excess = (level - known.lit_db)[lit]
+    first = float(excess.median()) if len(excess) else float(level.median()) + 20
+    start = torch.tensor([[first, 0.0, 1.0, float(level.median()) - 6.0, 0.0]])
+    common = _refine(start, start, 0.0, everyone, known, level, weight)
+    count = int(scattering.segment_of.max()) + 1
+    return _refine(common.expand(count, -1).clone(), common, SHRINK, segment, known, level, weight)
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """Of each observation: lit_db `[M]`: 10 log10(V / d^2); cosine `[M]`; lobe_db `[M]`: 10 log10((1 + r . v) / 2);
+    far_db `[M]`: 10 log10(d / 5 m)."""
+
+    lit_db: Tensor
+    cosine: Tensor
+    lobe_db: Tensor
+    far_db: Tensor
+
+
+def _known(scattering: Scattering, g: Tensor, along: Tensor) -> _Known:
+    """The parts of the laws that are known, for Gaussians `[M]` seen along `[M, 3]`."""
+    distance = scattering.distance[g]
+    visible = 10 * torch.log10(scattering.visibility[g].clamp_min(DARK * DARK))
+    psi = -(scattering.mirrored[g] * along).sum(-1)
+    return _Known(
+        lit_db=visible - 20 * torch.log10(distance),
+        cosine=scattering.cosine[g],
+        lobe_db=10 * torch.log10((0.5 + 0.5 * psi).clamp_min(1e-6)),
+        far_db=10 * torch.log10(distance / AMBIENT_DISTANCE),
+    )
+
+
+def law_db(laws: Tensor, known: _Known) -> tuple[Tensor, Tensor]:
+    """Lit and ambient level `[M]` [dB] by `laws` `[M, 5]`."""
+    level, slope, lobe, ambient, falloff = laws.unbind(-1)
+    lit = level + known.lit_db + DB * slope * known.cosine + lobe * known.lobe_db
+    return lit, ambient + falloff * known.far_db
+
+
+def _refine(
+    laws: Tensor, common: Tensor, shrink: float, segment: Tensor, known: _Known, level: Tensor, weight: Tensor
+) -> Tensor:
+    """Damped Gauss-Newton on all segments at once."""
+    count = len(laws)
+    prior = torch.diag(shrink / LAW_SPREAD.square() * SOFT_DB).double() + 1e-6 * torch.eye(5, dtype=torch.float64)
+    damping = torch.full((count,), 1e-2, dtype=torch.float64)
+
+    def cost_of(trial: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        lit, ambient = law_db(trial[segment], known)
+        total = torch.logaddexp(lit / DB, ambient / DB) * DB
+        error = level - total
+        soft = weight * SOFT_DB**2 * 2 * ((1 + (error / SOFT_DB).square()).sqrt() - 1)
+        cost = torch.zeros(count, dtype=torch.float64).index_add_(0, segment, soft.double())
+        away = (trial - common).double()
+        cost += (away @ prior * away).sum(-1)
+        return cost, lit, total, error
+
+    cost, lit, total, error = cost_of(laws)
+    for _ in range(STEPS):
+        share = 10 ** ((lit - total) / 10)
+        columns = (share, share * DB * known.cosine, share * known.lobe_db, 1 - share, (1 - share) * known.far_db)
+        jacobian = torch.stack(columns, -1)
+        robust = weight / (1 + (error / SOFT_DB).square()).sqrt()
+        weighted = jacobian * robust[:, None]
+        left = torch.zeros(count, 25, dtype=torch.float64)
+        left.index_add_(0, segment, (weighted[:, :, None] * jacobian[:, None, :]).reshape(-1, 25).double())
+        right = torch.zeros(count, 5, dtype=torch.float64)
+        right.index_add_(0, segment, (weighted * error[:, None]).double())
+        left = left.reshape(-1, 5, 5) + prior
+        right = right - (laws - common).double() @ prior
+        diagonal = torch.diag_embed(left.diagonal(dim1=-2, dim2=-1) * damping[:, None] + 1e-9)
+        step = torch.linalg.solve(left + diagonal, right)
+        trial = (laws + step.float()).clamp(LAW_LOW, LAW_HIGH)
+        new_cost, new_lit, new_total, new_error = cost_of(trial)
+        better = new_cost < cost
+        damping = torch.where(better, damping * 0.2, damping * 5).clamp(1e-6, 1e6)
+        laws = torch.where(better[:, None], trial, laws)
+        if bool(better.all()):
+            cost, lit, total, error = new_cost, new_lit, new_total, new_error
+        else:
+            cost, lit, total, error = cost_of(laws)
+    return laws
+
+
+@dataclass(frozen=True)
+class Ridge:
+    """How strongly each level of the residual is drawn to zero, in pixels that say so."""
+
+    segment: float = 30.0
+    cell: float = 30.0
+    level: float = 2.0
+
+
+RIDGE = Ridge()
+
+
+def refine_residual(
+    surface: LitSurface,
+    views: Sequence[LitView],
+    *,
+    passes: int,
+    floor_db: float,
+    ridge: Ridge = RIDGE,
+    backend: Backend = "auto",
+) -> LitSurface:
+    """The surface with the residual that makes up for what it lacks in `views`, in so many passes.
+
+    Each pass renders the views, throws their errors in dB back onto the Gaussians, and solves for what is lacking from
+    coarse to fine: harmonics of segments, harmonics of cells, levels. Levels under `floor_db` count as that.
+    """
+    for _ in range(passes):
+        lacking = shortfall(surface, views, floor_db, backend)
+        surface = _corrected(surface, views, lacking, ridge)
+    return surface
+
+
+def _corrected(surface: LitSurface, views: Sequence[LitView], lacking: Shortfall, ridge: Ridge) -> LitSurface:
+    receivers = torch.stack([one.view.position for one in views])
+    along = view_directions(surface.means[lacking.gaussian] - receivers[lacking.view], torch.zeros(3))
+    harmonics, weight = basis(along, 3), _worth(lacking.weight)
+    left_over = lacking.error_db
+    penalty = C0**2 * torch.diag((1.0 + BAND) ** 2)
+    found = []
+    for group, groups, strength in (
+        (surface.segment_of, len(surface.laws), ridge.segment),
+        (surface.cell_of, len(surface.cell_sh), ridge.cell),
+    ):
+        number = group[lacking.gaussian]
+        left, right = torch.zeros(groups, HARMONICS**2), torch.zeros(groups, HARMONICS)
+        for part in torch.arange(len(lacking)).split(ROWS_AT_ONCE):
+            weighted = harmonics[part] * weight[part, None]
+            products = weighted[:, :, None] * harmonics[part][:, None, :]
+            left.index_add_(0, number[part], products.reshape(len(part), -1))
+            right.index_add_(0, number[part], weighted * left_over[part, None])
+        correction = torch.linalg.solve(left.reshape(groups, HARMONICS, HARMONICS) + strength * penalty, right)
+        left_over = left_over - (harmonics * correction[number]).sum(-1)
+        found.append(correction)
+    total = torch.zeros(len(surface)).index_add_(0, lacking.gaussian, weight)
+    own = torch.zeros(len(surface)).index_add_(0, lacking.gaussian, weight * left_over) / (total + ridge.level)
+    level = (surface.level + own).clamp(-LARGEST_RESIDUAL_DB, LARGEST_RESIDUAL_DB)
+    return replace(surface, segment_sh=surface.segment_sh + found[0], cell_sh=surface.cell_sh + found[1], level=level)
+
+
+def fit_ambient(scattering: Scattering, seen: Observations, laws: Tensor, ridge: float = 1.0) -> Tensor:
+    """Delay [ns] up to the Gaussian and departure vector `[N, 4]` of the ambient part: what is left of the observed
+    means when the lit part's own are taken out, segment, cell, then Gaussian."""
+    count = len(scattering.means)
+    start = bounce(scattering.means, scattering.tx)
+    if seen.csi is None:
+        return start
+    g = seen.gaussian
+    along = _along(scattering, seen)
+    lit, ambient = law_db(laws[scattering.segment_of[g]], _known(scattering, g, along))
+    share = 1 - torch.sigmoid((lit - ambient) / DB)
+    late = torch.linalg.vector_norm(scattering.means[g] - seen.receivers[seen.view], dim=-1)
+    own = seen.csi.clone()
+    own[:, 0] -= late / (SPEED_OF_LIGHT * NANOSECOND)
+    straight = start[g]
+    weight = _worth(seen.weight)
+    groups = (scattering.segment_of, scattering.cell_of, torch.arange(count))
+    total = torch.zeros(count, 4)
+    for _ in range(AMBIENT_ROUNDS):
+        # An observed departure is a unit vector; the model's is shorter where its parts disagree.
+        blended = straight[:, 1:] + share[:, None] * total[g, 1:]
+        target = torch.cat((own[:, :1], own[:, 1:] * torch.linalg.vector_norm(blended, dim=-1, keepdim=True)), -1)
+        left_over = target - straight - share[:, None] * total[g]
+        for group in groups:
+            number, size = group[g], int(group.max()) + 1
+            left = torch.zeros(size).index_add_(0, number, weight * share * share)
+            right = torch.zeros(size, 4).index_add_(0, number, (weight * share)[:, None] * left_over)
+            found = right / (left + ridge)[:, None]
+            left_over = left_over - share[:, None] * found[number]
+            total += found[group]
+    return start + total
+
+
+def _along(scattering: Scattering, seen: Observations) -> Tensor:
+    return view_directions(scattering.means[seen.gaussian] - seen.receivers[seen.view], torch.zeros(3))
+
+
+def _worth(weight: Tensor) -> Tensor:
+    """What an observation counts: its pixels, at most a few, since neighbours in a picture are not independent."""
+    return weight / (1 + 0.25 * weight)
+
+
+def _some(count: int, most: int) -> Tensor:
+    """At most `most` of `count` rows, evenly spread and the same every time."""
+    return torch.arange(count) if count <= most else torch.linspace(0, count - 1, most, dtype=torch.float64).long()

@@ -1,0 +1,157 @@
+"""What the mirror model's surface is fitted to: training spectra without their point sources, thrown back onto the
+Gaussians in linear power.
+
+For each view the rasterizer's own gradient gives every Gaussian the mean power of the pixels that it decides, their
+mean delay and departure weighted by power, and how many pixels those are.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rf3dgs.core.errors import InputError
+from rf3dgs.core.grids import View, view_of
+from rf3dgs.field.lit import BLENDING, LitSurface
+from rf3dgs.field.radiance import NANOSECOND
+from rf3dgs.field.sources import Rays
+from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.splats.rasterize import Backend, rasterize
+from rf3dgs.training.radio_views import ruled
+
+LEAST_WEIGHT = 0.02  # [pixel]; what a view tells of fainter Gaussians is left out
+LEAST_POWER = 1e-30
+FARTHEST_DB = 15.0  # errors of pixels beyond this count as this
+
+
+@dataclass(frozen=True, eq=False)
+class LitView:
+    """One training spectrum without its point sources.
+
+    view: what it shows. keep `[row, col]`: solid angle of the pixel relative to the picture's mean, zero where point
+    sources bring more than 30 % of the power or there is none. channels `[row, col, 1 (+ 4)]`: the rest of the power,
+    linear, and that times delay [ns] and departure where the spectra have them.
+    """
+
+    view: View
+    keep: Tensor
+    channels: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """What views tell about Gaussians, one row for each pair: gaussian, view `[M]` long; weight `[M]` [pixel]; level_db
+    `[M]`: mean power; delay `[M]` [ns] and departure `[M, 3]`, means weighted by power, or None. receivers `[V, 3]`.
+    """
+
+    gaussian: Tensor
+    view: Tensor
+    weight: Tensor
+    level_db: Tensor
+    csi: Tensor | None
+    receivers: Tensor
+
+    def __len__(self) -> int:
+        return len(self.gaussian)
+
+
+@dataclass(frozen=True, eq=False)
+class Shortfall:
+    """What a surface lacks, one row for each pair of Gaussian and view: gaussian, view `[M]` long; weight `[M]`: pixels
+    times the Gaussian's share in their power; error_db `[M]`: mean of truth over model, weighted so."""
+
+    gaussian: Tensor
+    view: Tensor
+    weight: Tensor
+    error_db: Tensor
+
+    def __len__(self) -> int:
+        return len(self.gaussian)
+
+
+def lit_views(spectra: Spectrum, rays: Sequence[Rays] | None) -> list[LitView]:
+    """The views of `spectra` `[position, row, col]`; `rays`: what reaches each position from point sources."""
+    if spectra.grid.kind == "list":
+        raise InputError("the radio stage needs pinhole or equirectangular spectra; got a list of directions")
+    return [_view(spectra[index], None if rays is None else rays[index]) for index in range(len(spectra))]
+
+
+def _view(one: Spectrum, rays: Rays | None) -> LitView:
+    area = one.grid.solid_angle / one.grid.solid_angle.mean()
+    power = one.power.double()[..., None]
+    channels = power
+    if one.delay is not None and one.aod is not None:
+        channels = torch.cat((power, power * one.delay.double()[..., None] / NANOSECOND, power * one.aod.double()), -1)
+    keep = area.clone()
+    if rays is not None and len(rays):
+        keep = area * ~ruled(one, rays)[1]
+        place, ray, share = rays.shares(one.directions, one.instrument)
+        known = torch.cat((torch.ones(len(rays), 1), rays.delay[:, None] / NANOSECOND, rays.departure), -1)
+        taken = (share[:, None] * known[ray])[:, : channels.shape[-1]].double()
+        flat = channels.reshape(-1, channels.shape[-1]).index_add(0, place, -taken)
+        channels = flat.reshape(channels.shape)
+    return LitView(view_of(one.pose, one.grid), keep * (channels[..., 0] > 0), channels)
+
+
+def observe(geometry: Gaussians, views: Sequence[LitView], *, unit: float, backend: Backend = "auto") -> Observations:
+    """What `views` tell about every Gaussian of `geometry`; `unit`: the power that counts as 1 on the way."""
+    geometry = geometry.detach()
+    shape = (geometry.means, geometry.quats, geometry.scales, geometry.opacities)
+    has_csi = all(view.channels.shape[-1] == 5 for view in views)
+    columns = 6 if has_csi else 2
+    rows = []
+    for number, one in enumerate(views):
+        values = torch.zeros((len(geometry), columns)).requires_grad_()
+        with torch.enable_grad():
+            raster = rasterize(*shape, values, one.view, compositing=BLENDING, backend=backend)
+            target = (one.channels[..., : columns - 1] / unit).float()
+            target = torch.cat((torch.ones_like(target[..., :1]), target), -1) * one.keep[..., None]
+            (sums,) = torch.autograd.grad(raster.values, values, target)
+        chosen = ((sums[:, 0] > LEAST_WEIGHT) & (sums[:, 1] > 0)).nonzero().squeeze(-1)
+        rows.append((chosen, torch.full_like(chosen, number), sums[chosen]))
+    gaussian, view, sums = _joined(rows)
+    power = sums[:, 1] / sums[:, 0] * unit
+    return Observations(
+        gaussian=gaussian,
+        view=view,
+        weight=sums[:, 0].contiguous(),
+        level_db=10 * torch.log10(power.clamp_min(LEAST_POWER)),
+        csi=sums[:, 2:] / sums[:, 1:2] if has_csi else None,
+        receivers=torch.stack([one.view.position for one in views]),
+    )
+
+
+def shortfall(surface: LitSurface, views: Sequence[LitView], floor_db: float, backend: Backend = "auto") -> Shortfall:
+    """What `surface` lacks in `views`, thrown back onto the Gaussians by their share in each pixel's power.
+
+    The share is the derivative of a pixel's level in a Gaussian's. Levels under `floor_db` count as that.
+    """
+    shape = (surface.means, surface.quats, surface.scales, surface.opacities)
+    rows = []
+    for number, one in enumerate(views):
+        with torch.no_grad():
+            sent = surface.values(one.view.position, csi=False)
+        values = sent.expand(-1, 2).contiguous().requires_grad_()
+        with torch.enable_grad():
+            raster = rasterize(*shape, values, one.view, compositing=BLENDING, backend=backend)
+            shown = raster.values.detach()[..., 0]
+            there = one.keep * (shown > 0)
+            floor = 10 ** (floor_db / 10) / surface.unit
+            truth = (one.channels[..., 0] / surface.unit).float().clamp_min(floor)
+            error = 10 * torch.log10(truth / shown.clamp_min(floor))
+            share = there / torch.where(shown > 0, shown, 1.0)
+            upstream = torch.stack((share, share * error.clamp(-FARTHEST_DB, FARTHEST_DB)), -1)
+            (sums,) = torch.autograd.grad(raster.values, values, upstream)
+        sums = sums * sent
+        chosen = (sums[:, 0] > LEAST_WEIGHT).nonzero().squeeze(-1)
+        rows.append((chosen, torch.full_like(chosen, number), sums[chosen]))
+    gaussian, view, sums = _joined(rows)
+    return Shortfall(gaussian, view, sums[:, 0].contiguous(), sums[:, 1] / sums[:, 0])
+
+
+def _joined(rows: Sequence[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
+    """The rows of all views, one after another."""
+    first, second, third = zip(*rows, strict=True)
+    return torch.cat(first), torch.cat(second), torch.cat(third)

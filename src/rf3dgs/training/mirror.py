@@ -1,0 +1,117 @@
+"""The mirror model's radio stage: spectra and frozen geometry to a `RadioField` whose parts are laws of physics.
+
+Closed form throughout: surfaces of the geometry, point sources (the transmitter and its mirror images), and then the
+surface part on what the point sources leave over. The same spectra and geometry give the same field.
+"""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.progress import Progress
+from rf3dgs.field.lit import HARMONICS, LitSurface
+from rf3dgs.field.radio_field import RadioField
+from rf3dgs.geometry import Surfaces, find_surfaces
+from rf3dgs.spectra.codec import DbWindow
+from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.splats.obstacles import Obstacles, visibility_of
+from rf3dgs.training.config import RadioConfig
+from rf3dgs.training.lit_fit import Scattering, fit_ambient, fit_laws, refine_residual
+from rf3dgs.training.lit_views import LitView, lit_views, observe
+from rf3dgs.training.source_fit import fit_sources
+
+CELL = 0.8  # m
+PASSES = 3
+DEEPEST_DB = 90.0  # under the window's ceiling; what is darker is the tail of a beam, or directions that no ray reached
+STAGES = ("surfaces", "point sources", "observations", "laws", "residual")
+
+
+def fit_mirror(
+    geometry: Gaussians,
+    spectra: Spectrum,
+    config: RadioConfig,
+    tx: Pose,
+    window: DbWindow,
+    colour: Tensor,
+    meta: dict[str, str | int | float | bool],
+    progress: Progress,
+) -> RadioField:
+    """The mirror model of checked `spectra` over checked `geometry`; see `fit_radio`.
+
+    `window` is that of the field's pictures, `colour` `[N, 3]` uint8 how a viewer paints it, `meta` what is known of
+    the run.
+    """
+    progress.start("radio stage", len(STAGES))
+    positions = spectra.pose.position
+    surfaces = find_surfaces(geometry, positions)
+    progress.update(1)
+    obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, geometry.opacities, surfaces.plane_of)
+    found = fit_sources(spectra, surfaces, obstacles, tx)
+    progress.update(2)
+    views = lit_views(spectra, found.rays)
+    surface = fit_surface(geometry, surfaces, obstacles, views, tx.position, window, config, progress)
+    progress.finish()
+    return RadioField(
+        surface=surface,
+        sources=found.sources,
+        plane_of=found.plane_of,
+        solidity=geometry.opacities.detach(),
+        frequency=spectra.frequency,
+        instrument=spectra.instrument,
+        tx=tx,
+        bounds=torch.stack((positions.amin(0), positions.amax(0))),
+        colour=colour,
+        meta=meta | {"positions in sight": int(found.seen.sum()), "segments": len(surface.laws)},
+        backend=config.backend,
+    )
+
+
+def fit_surface(
+    geometry: Gaussians,
+    surfaces: Surfaces,
+    obstacles: Obstacles,
+    views: list[LitView],
+    tx: Tensor,
+    window: DbWindow,
+    config: RadioConfig,
+    progress: Progress,
+) -> LitSurface:
+    """The surface part of the model, fitted to `views`, in which point sources are already taken out."""
+    visibility = visibility_of(obstacles, geometry.means, surfaces.normals, tx, surfaces.plane_of)
+    cells = cells_of(geometry.means, surfaces.segment_of)
+    scattering = Scattering.of(geometry.means, surfaces.normals, visibility, surfaces.segment_of, cells, tx)
+    seen = observe(geometry, views, unit=10 ** (window.ceil_db / 10), backend=config.backend)
+    floor_db = max(window.floor_db, window.ceil_db - DEEPEST_DB)
+    seen = replace(seen, level_db=seen.level_db.clamp_min(floor_db))
+    progress.update(3)
+    laws = fit_laws(scattering, seen)
+    progress.update(4)
+    bare = LitSurface(
+        means=geometry.means.detach(),
+        quats=geometry.quats.detach(),
+        log_scales=geometry.log_scales.detach(),
+        logit_opacities=geometry.logit_opacities.detach(),
+        normals=scattering.normals,
+        visibility=scattering.visibility,
+        segment_of=scattering.segment_of,
+        cell_of=scattering.cell_of,
+        laws=laws,
+        segment_sh=torch.zeros(len(laws), HARMONICS),
+        cell_sh=torch.zeros(int(cells.max()) + 1, HARMONICS),
+        level=torch.zeros(len(geometry)),
+        ambient=fit_ambient(scattering, seen, laws),
+        tx=tx,
+        window=window,
+    )
+    surface = refine_residual(bare, views, passes=PASSES, floor_db=floor_db, backend=config.backend)
+    progress.update(5)
+    return surface
+
+
+def cells_of(means: Tensor, segment_of: Tensor) -> Tensor:
+    """The cell `[N]` of each Gaussian: a number, from 0 without gaps, for every cube of 0.8 m of every segment."""
+    key = torch.cat((torch.floor(means / CELL).long(), segment_of[:, None]), -1)
+    return torch.unique(key, dim=0, return_inverse=True)[1]
