@@ -10,6 +10,7 @@ import torch
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import equirect_grid, pinhole_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.field.images import image_chain, mirrored, sequences
 from rf3dgs.field.sources import RAY_FIELDS, Marks, PointSources
@@ -17,6 +18,7 @@ from rf3dgs.field.ways import Reach
 from rf3dgs.geometry import Patches, Planes
 from rf3dgs.geometry.patches import plane_axes
 from rf3dgs.propagation.room import shoebox
+from rf3dgs.spectra.spectrum import Instrument
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.splats.surface import sample_mesh
@@ -248,6 +250,20 @@ def test_a_decided_line_of_sight_is_taken_for_each_receiver(monkeypatch):
     seen = torch.arange(10) % 3 == 0
     found = box_sources(1).rays_each(receivers(10), FREE, in_sight=seen)
     assert [0 in rays.order.tolist() for rays in found] == seen.tolist()
+
+
+@pytest.mark.parametrize("grid", [equirect_grid(90, 45), pinhole_grid(70, 50, 100.0)])
+def test_a_picture_is_the_sum_of_all_lobes(grid):
+    """Against every pixel and every ray; what is beyond 3.2 lobes is 123 dB down, and float32 has 7 digits."""
+    pose = Pose.look_at([4.0, 3.1, 1.4], TX + 0.3)
+    instrument = Instrument.gaussian(math.radians(7))
+    rays = box_sources(2).rays(pose.position, FREE)
+    pixels = pose.to_world(grid.directions)[..., None, :]
+    angle = angle_between(*torch.broadcast_tensors(pixels, rays.arrival))
+    expected = (instrument.kernel(angle) * rays.power).sum(-1)
+    assert float(expected.max()) > 0.5 * float(rays.power.max())
+    picture = rays.picture(pose, grid, instrument)
+    torch.testing.assert_close(picture, expected, rtol=1e-4, atol=1e-12 * float(rays.power.sum()))
 
 
 def test_a_mark_changes_the_reflection_where_it_is():

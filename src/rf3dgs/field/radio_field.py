@@ -218,18 +218,29 @@ def with_rays(surface: Radiance, rays: Rays, pose: Pose, grid: DirectionGrid, in
 
     Delay and departure, where the surface has them, are means weighted by power.
     """
-    place, ray, share = rays.shares(pose.to_world(grid.directions), instrument)
+    place, ray, share = rays.shares(pose, grid, instrument)
+    touched = torch.zeros(grid.solid_angle.numel(), dtype=torch.bool)
+    touched[place] = True
+    pixels = torch.nonzero(touched).squeeze(1)
+    row = torch.empty(len(touched), dtype=torch.long)
+    row[pixels] = torch.arange(len(pixels))
+    row = row[place]
 
-    def added(to: Tensor, what: Tensor) -> Tensor:
-        flat = to.reshape(grid.solid_angle.numel(), *what.shape[1:])
-        return flat.index_add(0, place, what).reshape(to.shape)
+    def summed(what: Tensor) -> Tensor:
+        return what.new_zeros(len(pixels), *what.shape[1:]).index_add_(0, row, what)
 
-    power = added(surface.power, share)
+    def changed(of: Tensor, to: Tensor) -> Tensor:
+        flat = of.flatten(0, 1).clone()
+        flat[pixels] = to
+        return flat.reshape(of.shape)
+
+    before = surface.power.flatten()[pixels]
+    power = before + summed(share)
+    whole = changed(surface.power, power)
     if surface.delay is None or surface.aod is None:
-        return Radiance(power)
-    delay = added(surface.power * surface.delay, share * rays.delay[ray])
-    aod = added(surface.power[..., None] * surface.aod, share[:, None] * rays.departure[ray])
-    reached = power > 0
-    scale = torch.where(reached, power, 1.0)
-    delay = torch.where(reached, delay / scale, torch.zeros_like(power))
-    return Radiance(power, delay, torch.nn.functional.normalize(aod / scale[..., None], dim=-1, eps=1e-9))
+        return Radiance(whole)
+    power = power.clamp_min(torch.finfo(power.dtype).tiny)
+    delay = (before * surface.delay.flatten()[pixels] + summed(share * rays.delay[ray])) / power
+    aod = before[:, None] * surface.aod.flatten(0, 1)[pixels] + summed(share[:, None] * rays.departure[ray])
+    aod = torch.nn.functional.normalize(aod / power[:, None], dim=-1, eps=1e-9)
+    return Radiance(whole, changed(surface.delay, delay), changed(surface.aod, aod))

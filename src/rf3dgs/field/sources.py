@@ -13,8 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import DirectionGrid
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.field.images import HIGHEST_ORDER, image_chain
 from rf3dgs.field.ways import Plan, Ways, ways_over
@@ -25,7 +26,7 @@ from rf3dgs.splats.obstacles import Obstacles
 MARK_PRIOR = 0.05  # weight of no deviation beside marks of weight 1 where they are
 AT_ONCE = 256  # receivers
 RAY_FIELDS = ("index", "power", "arrival", "departure", "delay", "order", "points")
-FARTHEST_LOBES = 6.2  # where a lobe's kernel is zero in float32
+FARTHEST_LOBES = 3.2  # where a lobe has fallen by 123 dB
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,22 +53,27 @@ class Rays:
         """Some of the rays: `chosen` is a mask `[k]` or a list of places."""
         return Rays(*(getattr(self, name)[chosen] for name in RAY_FIELDS))
 
-    def shares(self, directions: Tensor, instrument: Instrument) -> tuple[Tensor, Tensor, Tensor]:
-        """What an instrument sees of each ray: place in the flattened picture `[n]`, ray `[n]` and power `[n]`.
+    def shares(self, pose: Pose, grid: DirectionGrid, instrument: Instrument) -> tuple[Tensor, Tensor, Tensor]:
+        """What an instrument at one `pose` sees of each ray: place in the flattened grid `[n]`, ray `[n]`, power `[n]`.
 
-        directions `[*shape, 3]`: unit vectors of the pixels in the world; pairs of no power are left out.
+        Pixels farther than `FARTHEST_LOBES` from a ray are left out.
         """
-        flat = directions.reshape(-1, 3)
-        reach = math.cos(min(math.pi, FARTHEST_LOBES * instrument.lobe))
-        place, ray = torch.nonzero(flat @ self.arrival.mT >= reach - 1e-6, as_tuple=True)
-        kernel = instrument.kernel(angle_between(flat[place], self.arrival[ray]))
-        return place, ray, kernel * self.power[ray]
+        cut, blocks = min(math.pi, FARTHEST_LOBES * instrument.lobe), grid.blocks
+        arrival = pose.to_device(self.arrival)
+        block, ray = blocks.near(arrival, cut)
+        chord2 = (blocks.directions[block] - arrival[ray, :, None]).square_().sum(1)
+        row, pixel = torch.nonzero(chord2 <= 4.0 * math.sin(0.5 * cut) ** 2, as_tuple=True)
+        place = blocks.pixels[block[row], pixel]
+        within = place >= 0
+        row, pixel, place = row[within], pixel[within], place[within]
+        angle = 2.0 * torch.asin((0.5 * chord2[row, pixel].sqrt()).clamp_max(1.0))
+        ray = ray[row]
+        return place, ray, instrument.kernel(angle) * self.power[ray]
 
-    def picture(self, directions: Tensor, instrument: Instrument) -> Tensor:
-        """Power `[*shape]`, linear, that the instrument sees along world directions `[*shape, 3]`."""
-        place, _, share = self.shares(directions, instrument)
-        picture = share.new_zeros(directions[..., 0].numel()).index_add_(0, place, share)
-        return picture.reshape(directions.shape[:-1])
+    def picture(self, pose: Pose, grid: DirectionGrid, instrument: Instrument) -> Tensor:
+        """Power `[row, col]`, linear, that the instrument sees at one `pose`."""
+        place, _, share = self.shares(pose, grid, instrument)
+        return share.new_zeros(grid.shape).flatten().index_add_(0, place, share).reshape(grid.shape)
 
 
 @dataclass(frozen=True, eq=False)
