@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from rf3dgs.core.angles import direction_of
+from rf3dgs.core.angles import angle_between, direction_of
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import (
@@ -122,3 +122,16 @@ def test_bad_grids_are_refused() -> None:
         list_grid(torch.eye(3)[:2], torch.ones(3))
     with pytest.raises(InputError, match=r"directions must be \[direction, 3\]"):
         list_grid(torch.zeros(3))
+
+
+@pytest.mark.parametrize("grid", [equirect_grid(50, 25), pinhole_grid(31, 40, 100.0)])
+def test_blocks_hold_every_pixel_once_and_find_those_near(grid):
+    blocks = grid.blocks
+    real = blocks.pixels >= 0
+    assert blocks.pixels[real].sort().values.tolist() == list(range(grid.height * grid.width))
+    assert torch.equal(blocks.directions.mT[real], grid.directions.reshape(-1, 3)[blocks.pixels[real]])
+    asked = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(2)), dim=-1)
+    block, row = blocks.near(asked, 0.2)
+    found = {(place, who) for at, who in zip(block, row.tolist(), strict=True) for place in blocks.pixels[at].tolist()}
+    angle = angle_between(*torch.broadcast_tensors(grid.directions.reshape(-1, 1, 3), asked))
+    assert {(int(place), int(who)) for place, who in torch.nonzero(angle <= 0.2)} <= found

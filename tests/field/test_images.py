@@ -3,17 +3,22 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import equirect_grid, pinhole_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.field.images import image_chain, mirrored, sequences
-from rf3dgs.field.sources import Marks, PointSources, Reach
+from rf3dgs.field.sources import RAY_FIELDS, Marks, PointSources
+from rf3dgs.field.ways import Reach
 from rf3dgs.geometry import Patches, Planes
+from rf3dgs.geometry.patches import plane_axes
 from rf3dgs.propagation.room import shoebox
+from rf3dgs.spectra.spectrum import Instrument
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.splats.surface import sample_mesh
@@ -204,7 +209,61 @@ def test_reach_answers_as_patches_do():
     patches = Patches.of(planes, points)
     asked = torch.rand(3000, 3, generator=generator) * SIZE
     plane = torch.randint(6, (3000,), generator=generator)
-    assert torch.equal(Reach.of(patches).holds(asked, plane), patches.holds(asked, plane))
+    answer = Reach.of(patches).holds(asked.double().numpy(), plane.numpy())
+    assert answer.tolist() == patches.holds(asked, plane).tolist()
+
+
+def test_reach_is_empty_far_beyond_its_cells():
+    floor = Planes(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1))
+    reach = Reach.of(Patches.of(floor, [torch.tensor([[0.05, 0.05, 0.0], [0.15, 0.05, 0.0]])]))
+    local = np.array([[0.05, 0.05], [0.05, 0.15], [0.05, 0.25], [1e15, 0.05], [-1e15, -1e15]])
+    points = local @ plane_axes(floor.normals)[0].double().numpy()
+    assert reach.holds(points, np.zeros(5, dtype=np.int64)).tolist() == [True, True, False, False, False]
+
+
+def test_many_receivers_get_what_each_gets_alone(monkeypatch):
+    """Answers do not depend on who else is asked, nor on the parts in which many are answered."""
+    solid = column()
+    obstacles = Obstacles(solid.means, solid.quats, solid.scales, solid.opacities)
+    where, sources = receivers(50, 9), box_sources(3)
+    alone = [sources.rays(here, obstacles) for here in where]
+    assert len({len(rays) for rays in alone}) > 3
+    for at_once in (256, 8):
+        monkeypatch.setattr("rf3dgs.field.sources.AT_ONCE", at_once)
+        place, joined = sources.arrivals(where, obstacles)
+        assert bool((place.diff() >= 0).all())
+        for number, one in enumerate(alone):
+            for name in RAY_FIELDS:
+                assert torch.equal(getattr(joined, name)[place == number], getattr(one, name))
+        for one, rays in zip(alone, sources.rays_each(where, obstacles), strict=True):
+            assert torch.equal(rays.power, one.power)
+
+
+def test_nobody_to_ask_gives_no_rays():
+    place, rays = box_sources(2).arrivals(torch.zeros(0, 3), FREE)
+    assert len(place) == len(rays) == 0
+    assert box_sources(2).rays_each(torch.zeros(0, 3), FREE) == []
+
+
+def test_a_decided_line_of_sight_is_taken_for_each_receiver(monkeypatch):
+    monkeypatch.setattr("rf3dgs.field.sources.AT_ONCE", 4)
+    seen = torch.arange(10) % 3 == 0
+    found = box_sources(1).rays_each(receivers(10), FREE, in_sight=seen)
+    assert [0 in rays.order.tolist() for rays in found] == seen.tolist()
+
+
+@pytest.mark.parametrize("grid", [equirect_grid(90, 45), pinhole_grid(70, 50, 100.0)])
+def test_a_picture_is_the_sum_of_all_lobes(grid):
+    """Against every pixel and every ray; what is beyond 3.2 lobes is 123 dB down, and float32 has 7 digits."""
+    pose = Pose.look_at([4.0, 3.1, 1.4], TX + 0.3)
+    instrument = Instrument.gaussian(math.radians(7))
+    rays = box_sources(2).rays(pose.position, FREE)
+    pixels = pose.to_world(grid.directions)[..., None, :]
+    angle = angle_between(*torch.broadcast_tensors(pixels, rays.arrival))
+    expected = (instrument.kernel(angle) * rays.power).sum(-1)
+    assert float(expected.max()) > 0.5 * float(rays.power.max())
+    picture = rays.picture(pose, grid, instrument)
+    torch.testing.assert_close(picture, expected, rtol=1e-4, atol=1e-12 * float(rays.power.sum()))
 
 
 def test_a_mark_changes_the_reflection_where_it_is():

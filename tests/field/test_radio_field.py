@@ -169,6 +169,18 @@ def test_sources_alone_are_asked_without_a_search_for_peaks(field):
     assert torch.equal(paths.coeff[0], everything.coeff[first])
 
 
+@pytest.mark.parametrize("parts", ["all", "sources"])
+def test_a_batch_has_the_paths_of_its_poses(field, room, parts):
+    poses = room.receivers(6, 5)
+    batch = Pose(poses.position.reshape(2, 3, 3), poses.orientation.reshape(2, 3, 4))
+    whole = field.paths(batch, parts=parts, strongest=5)
+    assert whole.delay.shape == (2, 3, 5)
+    for index in range(6):
+        one = field.paths(poses[index], parts=parts, strongest=5)
+        for name in ("coeff", "delay", "aoa_zenith", "aod_azimuth", "valid", "order", "kind"):
+            assert torch.equal(getattr(whole.flat(), name)[index], getattr(one, name))
+
+
 def test_a_channel_comes_out_of_the_paths(field):
     from rf3dgs.channel.arrays import ofdm, planar_array
 

@@ -9,7 +9,7 @@ import rf3dgs
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import equirect_grid
+from rf3dgs.core.grids import equirect_grid, list_grid
 from rf3dgs.core.units import friis_gain
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.field.sources import PointSources
@@ -115,5 +115,5 @@ def test_a_beam_is_one_at_its_centre_and_half_at_half_a_lobe():
     rays = PointSources.line_of_sight(torch.tensor([5.0, 0.0, 0.0]), 60e9).rays(torch.zeros(3), free)
     half = math.radians(1.5)
     directions = torch.tensor([[1.0, 0.0, 0.0], [math.cos(half), math.sin(half), 0.0], [-1.0, 0.0, 0.0]])
-    beam = rays.picture(directions, Instrument.gaussian(math.radians(3))) / rays.power
-    torch.testing.assert_close(beam, torch.tensor([1.0, 0.5, 0.0]), atol=1e-4, rtol=0)
+    beam = rays.picture(Pose(torch.zeros(3)), list_grid(directions), Instrument.gaussian(math.radians(3))) / rays.power
+    torch.testing.assert_close(beam, torch.tensor([[1.0, 0.5, 0.0]]), atol=1e-4, rtol=0)

@@ -5,17 +5,39 @@ Looking out of the array, row 0 is up and column 0 is left, so a spectrum and a 
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import torch
 from torch import Tensor
 
-from rf3dgs.core.angles import angles_of, direction_of
+from rf3dgs.core.angles import angle_between, angles_of, direction_of
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import CAMERA_FROM_DEVICE, Pose
 
 MAX_PIXELS = 64_000_000
+BLOCK = 12  # pixels on a side of the blocks that tell which pixels are near a direction
 GridKind = Literal["pinhole", "equirect", "list"]
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Small blocks of neighbouring pixels of a grid.
+
+    pixels `[block, pixel]`: places in the flattened grid, -1 is none. directions `[block, 3, pixel]`: theirs. middles
+    `[block, 3]`: unit vectors. radius `[block]` [rad]: how far pixels are from it; pi of a block around the sphere.
+    """
+
+    pixels: Tensor
+    directions: Tensor
+    middles: Tensor
+    radius: Tensor
+
+    def near(self, directions: Tensor, cut: float) -> tuple[Tensor, Tensor]:
+        """Blocks `[n]` and rows `[n]` of `directions` `[m, 3]`: those that may be within `cut` [rad] of each other."""
+        least = torch.cos((cut + self.radius).clamp_max(math.pi)) - 1e-5
+        block, row = torch.nonzero(self.middles @ directions.mT >= least[:, None], as_tuple=True)
+        return block, row
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +73,21 @@ class DirectionGrid:
         if self.K is not None:
             return float(torch.atan(1.0 / torch.minimum(self.K[0, 0], self.K[1, 1])))
         raise InputError("a list of directions has no pixel spacing; use a pinhole or equirectangular grid")
+
+    @cached_property
+    def blocks(self) -> Blocks:
+        """The pixels in blocks, by which those near a direction are found without asking all."""
+        height, width = self.shape
+        tall = min(BLOCK, height)
+        number = torch.arange(height * width).reshape(height, width)
+        number = torch.nn.functional.pad(number, (0, -width % BLOCK, 0, -height % tall), value=-1)
+        pixels = number.reshape(number.shape[0] // tall, tall, number.shape[1] // BLOCK, BLOCK)
+        pixels = pixels.transpose(1, 2).reshape(-1, tall * BLOCK)
+        members = self.directions.reshape(-1, 3)[torch.where(pixels < 0, pixels[:, :1], pixels)]
+        middles = members.mean(1)
+        radius = angle_between(members, middles[:, None].expand_as(members)).amax(1)
+        radius = torch.where(torch.linalg.vector_norm(middles, dim=-1) < 0.01, torch.full_like(radius, math.pi), radius)
+        return Blocks(pixels, members.mT.contiguous(), torch.nn.functional.normalize(middles, dim=-1), radius)
 
     def same_as(self, other: "DirectionGrid") -> bool:
         """True when both grids look in the same directions, pixel by pixel."""

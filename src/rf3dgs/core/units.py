@@ -10,6 +10,7 @@ from torch import Tensor
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact
 LONGEST_DELAY = 1e-3  # [s], the way of light over 300 km; what lies beyond is in another unit
 Distance = TypeVar("Distance", float, np.ndarray)
+Length = TypeVar("Length", np.ndarray, Tensor)
 
 
 def wavelength(frequency: float) -> float:
@@ -32,6 +33,6 @@ def shortest_delay(distance: Distance) -> Distance:
     return (0.9 * distance - 0.05) / SPEED_OF_LIGHT
 
 
-def friis_gain(distance: Tensor, frequency: float) -> Tensor:
+def friis_gain(distance: Length, frequency: float) -> Length:
     """Free-space path gain `(lambda / 4 pi d)^2` between isotropic antennas; distance [m]. Paper eq. 10."""
     return (wavelength(frequency) / (4.0 * math.pi * distance)) ** 2

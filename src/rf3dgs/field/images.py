@@ -1,36 +1,13 @@
-"""Images of the transmitter in mirrors, and the broken line from it over them to a receiver.
+"""Images of the transmitter in mirrors.
 
 Pure functions of arrays. A sequence names the planes that a wave meets, in the order from the transmitter; its image is
-the transmitter mirrored in each of them in turn. The straight line from the receiver to the image, folded back at the
-planes, is the only candidate for a mirror path along this sequence: whether it is one depends on where the planes have
-surface and on what stands in the way, which is asked elsewhere.
+the transmitter mirrored in each of them in turn. Which ways lead over them to a receiver is asked in `field.ways`.
 """
-
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 HIGHEST_ORDER = 3
-NEAREST = 1e-6  # share of a leg below which an end lies on the plane itself
-
-
-@dataclass(frozen=True, eq=False)
-class Folded:
-    """Broken lines from the transmitter over K sequences to receivers `[*batch]`.
-
-    points `[*batch, K, 3, 3]`: where each plane of the sequence is met [m], the receiver beyond the last. possible
-    `[*batch, K]`: every point lies between its neighbours. cosine `[*batch, K, 3]`: of the angle of incidence, 1 beyond
-    the last. distance `[*batch, K]`: whole length [m]. arrival, departure `[*batch, K, 3]`: unit vectors from the
-    receiver to the last point and from the transmitter to the first.
-    """
-
-    points: Tensor
-    possible: Tensor
-    cosine: Tensor
-    distance: Tensor
-    arrival: Tensor
-    departure: Tensor
 
 
 def mirrored(points: Tensor, normals: Tensor, offsets: Tensor) -> Tensor:
@@ -53,51 +30,6 @@ def image_chain(tx: Tensor, normals: Tensor, offsets: Tensor, sequence: Tensor) 
         image = mirrored(chain[-1], normals[index], offsets[index])
         chain.append(torch.where((plane >= 0)[:, None], image, chain[-1]))
     return torch.stack(chain, 1)
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """What folding asks of K sequences, the last reflection first: for each step the rows that have one `[K]`, normals
-    `[K, 3]`, offsets `[K]` and images `[K, 3]`; tx `[3]` and the last images `[K, 3]`.
-    """
-
-    tx: Tensor
-    last: Tensor
-    steps: tuple[tuple[Tensor, Tensor, Tensor, Tensor], ...]
-
-
-def plan_of(chain: Tensor, normals: Tensor, offsets: Tensor, sequence: Tensor) -> Plan:
-    """The plan for the images `[K, 4, 3]` of sequences `[K, 3]` over planes `[P, 3]` and `[P]`."""
-    highest = int((sequence >= 0).sum(-1).max()) if len(sequence) else 0
-    steps = []
-    for step in reversed(range(highest)):
-        index = sequence[:, step].clamp_min(0)
-        steps.append((sequence[:, step] >= 0, normals[index], offsets[index], chain[:, step + 1]))
-    return Plan(chain[0, 0], chain[:, -1], tuple(steps))
-
-
-def fold(plan: Plan, receivers: Tensor) -> Folded:
-    """The broken lines of a plan to receivers `[*batch, 3]`."""
-    here = receivers[..., None, :]
-    line = plan.last - here
-    distance = torch.linalg.vector_norm(line, dim=-1).clamp_min(1e-3)
-    shape = (*receivers.shape[:-1], len(plan.last))
-    point = here.expand(*shape, 3)
-    possible = torch.ones(shape, dtype=torch.bool)
-    points = [point] * (HIGHEST_ORDER - len(plan.steps))
-    cosine = [distance.new_ones(()).expand(shape)] * (HIGHEST_ORDER - len(plan.steps))
-    for active, normal, offset, image in plan.steps:
-        leg = image - point
-        fall = (leg * normal).sum(-1)
-        share = (offset - (point * normal).sum(-1)) / torch.where(fall.abs() < 1e-12, 1e-12, fall)
-        possible &= ~active | ((share > NEAREST) & (share < 1.0 - NEAREST))
-        point = torch.where(active[:, None], point + share[..., None] * leg, point)
-        length = torch.linalg.vector_norm(leg, dim=-1).clamp_min(1e-9)
-        cosine.append(torch.where(active, fall.abs() / length, 1.0))
-        points.append(point)
-    departure = torch.nn.functional.normalize(point - plan.tx, dim=-1, eps=1e-9)
-    cosines = torch.stack(cosine[::-1], -1)
-    return Folded(torch.stack(points[::-1], -2), possible, cosines, distance, line / distance[..., None], departure)
 
 
 def sequences(count: int, order: int, *, third: Tensor | None = None) -> Tensor:

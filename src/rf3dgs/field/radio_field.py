@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,6 +27,8 @@ from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.splats.rasterize import Backend
+
+COLUMNS = 10  # of a table of paths
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,20 +112,22 @@ class RadioField:
             raise InputError(f"strongest must be at least 1; got {strongest}")
         if parts not in ("all", "sources"):
             raise InputError(f'parts must be "all" or "sources"; got "{parts}"')
-        flat = pose.flat()
-        if len(flat) == 0:
+        positions = pose.position.reshape(-1, 3)
+        if len(positions) == 0:
             raise InputError("paths needs at least one pose; got an empty batch")
-        rows = [self._paths_of_one(flat[index], strongest, parts == "all") for index in range(len(flat))]
-        table = torch.stack(rows).reshape(*pose.batch_shape, strongest, 10)
-        aoa_zenith, aoa_azimuth = angles_of(table[..., 2:5])
-        aod_zenith, aod_azimuth = angles_of(table[..., 5:8])
+        rows = self._strongest_rays(positions, strongest)
+        if parts == "all":
+            flat = pose.flat()
+            rows = torch.stack([self._with_peaks(row, flat[index]) for index, row in enumerate(rows)])
+        table = rows.reshape(*pose.batch_shape, strongest, COLUMNS)
+        zenith, azimuth = angles_of(table[..., 2:8].unflatten(-1, (2, 3)))
         return Paths(
-            coeff=table[..., 0].clamp_min(0).sqrt().to(torch.complex64),
+            coeff=table[..., 0].sqrt().to(torch.complex64),
             delay=table[..., 1],
-            aoa_zenith=aoa_zenith,
-            aoa_azimuth=aoa_azimuth,
-            aod_zenith=aod_zenith,
-            aod_azimuth=aod_azimuth,
+            aoa_zenith=zenith[..., 0],
+            aoa_azimuth=azimuth[..., 0],
+            aod_zenith=zenith[..., 1],
+            aod_azimuth=azimuth[..., 1],
             valid=table[..., 0] > 0,
             frequency=self.frequency,
             tx=self.tx,
@@ -162,22 +167,38 @@ class RadioField:
         picture = self.surface.picture(view_of(pose, sphere), csi=csi, backend=self.backend)
         return sample_grid(picture, sphere, grid.directions)
 
-    def _paths_of_one(self, pose: Pose, strongest: int, with_peaks: bool) -> Tensor:
-        """Rows `[strongest, 10]`: gain, delay, arrival (3), departure (3), order, kind; zero gain is padding."""
-        table = torch.zeros(0, 10)
-        if self.sources is not None:
-            rays = self.sources.rays(pose.position, self.obstacles)
-            numbers = torch.stack((rays.order, rays.order.clamp_max(1)), -1).to(rays.power.dtype)
-            head = torch.stack((rays.power, rays.delay), -1)
-            table = torch.cat((head, rays.arrival, rays.departure, numbers), -1)
-            table = table[table[:, 0].argsort(descending=True, stable=True)][:strongest]
-        if with_peaks and len(table) < strongest:
-            table = torch.cat((table, self._peaks(pose, strongest)[: strongest - len(table)]))
-            table = table[table[:, 0].argsort(descending=True, stable=True)]
-        return torch.cat((table, torch.zeros(strongest - len(table), 10)))
+    def _strongest_rays(self, positions: Tensor, strongest: int) -> Tensor:
+        """Rows `[n, strongest, COLUMNS]` of what point sources send to receivers `[n, 3]`, the strongest first.
+
+        Columns: gain, delay, arrival (3), departure (3), order, kind; zero gain is padding.
+        """
+        table = np.zeros((len(positions), strongest, COLUMNS), dtype=np.float32)
+        if self.sources is None:
+            return torch.from_numpy(table)
+        place, rays = self.sources.arrivals(positions, self.obstacles)
+        here, power, order = place.numpy(), rays.power.numpy(), rays.order.numpy()
+        chosen = np.lexsort((-power, here))
+        begin = np.searchsorted(here, np.arange(len(positions)))
+        rank = np.arange(len(here)) - begin[here]
+        first = np.flatnonzero(rank < strongest)
+        row, rank, chosen = here[first], rank[first], chosen[first]
+        table[row, rank, 0], table[row, rank, 1] = power[chosen], rays.delay.numpy()[chosen]
+        table[row, rank, 2:5] = rays.arrival.numpy()[chosen]
+        table[row, rank, 5:8] = rays.departure.numpy()[chosen]
+        table[row, rank, 8], table[row, rank, 9] = order[chosen], np.minimum(order[chosen], 1)
+        return torch.from_numpy(table)
+
+    def _with_peaks(self, row: Tensor, pose: Pose) -> Tensor:
+        """Rows `[strongest, COLUMNS]` as above with the places that are left filled by peaks of the surface."""
+        count = int((row[:, 0] > 0).sum())
+        if count == len(row):
+            return row
+        peaks = self._peaks(pose, len(row))[: len(row) - count]
+        row = torch.cat((row[:count], peaks, row.new_zeros(len(row) - count - len(peaks), COLUMNS)))
+        return row[row[:, 0].argsort(descending=True, stable=True)]
 
     def _peaks(self, pose: Pose, count: int) -> Tensor:
-        """At most `count` rows `[n, 10]` as above, of peaks of the surface's spectrum."""
+        """At most `count` rows `[n, COLUMNS]` as above, of peaks of the surface's spectrum."""
         lobe = self.instrument.lobe
         width = min(360, max(72, 4 * math.ceil(0.5 * math.pi / (lobe / 1.5))))
         grid = equirect_grid(width, width // 2)
@@ -197,18 +218,29 @@ def with_rays(surface: Radiance, rays: Rays, pose: Pose, grid: DirectionGrid, in
 
     Delay and departure, where the surface has them, are means weighted by power.
     """
-    place, ray, share = rays.shares(pose.to_world(grid.directions), instrument)
+    place, ray, share = rays.shares(pose, grid, instrument)
+    touched = torch.zeros(grid.solid_angle.numel(), dtype=torch.bool)
+    touched[place] = True
+    pixels = torch.nonzero(touched).squeeze(1)
+    row = torch.empty(len(touched), dtype=torch.long)
+    row[pixels] = torch.arange(len(pixels))
+    row = row[place]
 
-    def added(to: Tensor, what: Tensor) -> Tensor:
-        flat = to.reshape(grid.solid_angle.numel(), *what.shape[1:])
-        return flat.index_add(0, place, what).reshape(to.shape)
+    def summed(what: Tensor) -> Tensor:
+        return what.new_zeros(len(pixels), *what.shape[1:]).index_add_(0, row, what)
 
-    power = added(surface.power, share)
+    def changed(of: Tensor, to: Tensor) -> Tensor:
+        flat = of.flatten(0, 1).clone()
+        flat[pixels] = to
+        return flat.reshape(of.shape)
+
+    before = surface.power.flatten()[pixels]
+    power = before + summed(share)
+    whole = changed(surface.power, power)
     if surface.delay is None or surface.aod is None:
-        return Radiance(power)
-    delay = added(surface.power * surface.delay, share * rays.delay[ray])
-    aod = added(surface.power[..., None] * surface.aod, share[:, None] * rays.departure[ray])
-    reached = power > 0
-    scale = torch.where(reached, power, 1.0)
-    delay = torch.where(reached, delay / scale, torch.zeros_like(power))
-    return Radiance(power, delay, torch.nn.functional.normalize(aod / scale[..., None], dim=-1, eps=1e-9))
+        return Radiance(whole)
+    power = power.clamp_min(torch.finfo(power.dtype).tiny)
+    delay = (before * surface.delay.flatten()[pixels] + summed(share * rays.delay[ray])) / power
+    aod = before[:, None] * surface.aod.flatten(0, 1)[pixels] + summed(share[:, None] * rays.departure[ray])
+    aod = torch.nn.functional.normalize(aod / power[:, None], dim=-1, eps=1e-9)
+    return Radiance(whole, changed(surface.delay, delay), changed(surface.aod, aod))

@@ -9,20 +9,24 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import DirectionGrid
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
-from rf3dgs.field.images import HIGHEST_ORDER, Folded, Plan, fold, image_chain, plan_of
+from rf3dgs.field.images import HIGHEST_ORDER, image_chain
+from rf3dgs.field.ways import Plan, Ways, ways_over
 from rf3dgs.geometry import Patches, Planes
-from rf3dgs.geometry.patches import CELL
 from rf3dgs.spectra.spectrum import Instrument
 from rf3dgs.splats.obstacles import Obstacles
 
 MARK_PRIOR = 0.05  # weight of no deviation beside marks of weight 1 where they are
-FARTHEST_LOBES = 6.2  # where a lobe's kernel is zero in float32
+AT_ONCE = 256  # receivers
+RAY_FIELDS = ("index", "power", "arrival", "departure", "delay", "order", "points")
+FARTHEST_LOBES = 3.2  # where a lobe has fallen by 123 dB
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,25 +51,29 @@ class Rays:
 
     def only(self, chosen: Tensor) -> "Rays":
         """Some of the rays: `chosen` is a mask `[k]` or a list of places."""
-        names = ("index", "power", "arrival", "departure", "delay", "order", "points")
-        return Rays(*(getattr(self, name)[chosen] for name in names))
+        return Rays(*(getattr(self, name)[chosen] for name in RAY_FIELDS))
 
-    def shares(self, directions: Tensor, instrument: Instrument) -> tuple[Tensor, Tensor, Tensor]:
-        """What an instrument sees of each ray: place in the flattened picture `[n]`, ray `[n]` and power `[n]`.
+    def shares(self, pose: Pose, grid: DirectionGrid, instrument: Instrument) -> tuple[Tensor, Tensor, Tensor]:
+        """What an instrument at one `pose` sees of each ray: place in the flattened grid `[n]`, ray `[n]`, power `[n]`.
 
-        directions `[*shape, 3]`: unit vectors of the pixels in the world; pairs of no power are left out.
+        Pixels farther than `FARTHEST_LOBES` from a ray are left out.
         """
-        flat = directions.reshape(-1, 3)
-        reach = math.cos(min(math.pi, FARTHEST_LOBES * instrument.lobe))
-        place, ray = torch.nonzero(flat @ self.arrival.mT >= reach - 1e-6, as_tuple=True)
-        kernel = instrument.kernel(angle_between(flat[place], self.arrival[ray]))
-        return place, ray, kernel * self.power[ray]
+        cut, blocks = min(math.pi, FARTHEST_LOBES * instrument.lobe), grid.blocks
+        arrival = pose.to_device(self.arrival)
+        block, ray = blocks.near(arrival, cut)
+        chord2 = (blocks.directions[block] - arrival[ray, :, None]).square_().sum(1)
+        row, pixel = torch.nonzero(chord2 <= 4.0 * math.sin(0.5 * cut) ** 2, as_tuple=True)
+        place = blocks.pixels[block[row], pixel]
+        within = place >= 0
+        row, pixel, place = row[within], pixel[within], place[within]
+        angle = 2.0 * torch.asin((0.5 * chord2[row, pixel].sqrt()).clamp_max(1.0))
+        ray = ray[row]
+        return place, ray, instrument.kernel(angle) * self.power[ray]
 
-    def picture(self, directions: Tensor, instrument: Instrument) -> Tensor:
-        """Power `[*shape]`, linear, that the instrument sees along world directions `[*shape, 3]`."""
-        place, _, share = self.shares(directions, instrument)
-        picture = share.new_zeros(directions[..., 0].numel()).index_add_(0, place, share)
-        return picture.reshape(directions.shape[:-1])
+    def picture(self, pose: Pose, grid: DirectionGrid, instrument: Instrument) -> Tensor:
+        """Power `[row, col]`, linear, that the instrument sees at one `pose`."""
+        place, _, share = self.shares(pose, grid, instrument)
+        return share.new_zeros(grid.shape).flatten().index_add_(0, place, share).reshape(grid.shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,49 +88,23 @@ class Marks:
     level_db: Tensor
     width: float
 
-    def at(self, points: Tensor, plane: Tensor, *, leave_out: bool = False) -> Tensor:
+    def at(self, points: np.ndarray, plane: np.ndarray, *, leave_out: bool = False) -> np.ndarray:
         """What is added at points `[n, 3]` of planes `[n]` [dB]: the mean of near marks, drawn to 0 where few are.
 
         With `leave_out` the points are those of the marks, and each is told by the others alone.
         """
-        weight = torch.exp(torch.cdist(points, self.points).square() * (-0.5 / self.width**2))
-        weight = weight * (plane[:, None] == self.plane)
+        where, whose, level_db = self._doubles
+        row, mark = np.nonzero(plane[:, None] == whose)
         if leave_out:
-            weight.fill_diagonal_(0.0)
-        return (weight @ self.level_db) / (weight.sum(-1) + MARK_PRIOR)
+            row, mark = row[row != mark], mark[row != mark]
+        apart = points[row] - where[mark]
+        weight = np.exp(np.einsum("ni,ni->n", apart, apart) * (-0.5 / self.width**2))
+        total = np.bincount(row, weight, len(points))
+        return np.bincount(row, weight * level_db[mark], len(points)) / (total + MARK_PRIOR)
 
-
-@dataclass(frozen=True, eq=False)
-class Reach:
-    """Patches whose every cell beside an occupied one, corners too, is filled: one look-up answers `Patches.holds`.
-
-    axes `[P, 2, 3]`, low `[P, 2]` in cells, shape `[P, 2]`, start `[P]` of each plane in cells `[cell]`.
-    """
-
-    axes: Tensor
-    low: Tensor
-    shape: Tensor
-    start: Tensor
-    cells: Tensor
-
-    @classmethod
-    def of(cls, patches: Patches) -> "Reach":
-        """The same surface, widened by a cell."""
-        shape, cells = patches.shape + 2, []
-        for plane in range(len(patches)):
-            grid = torch.nn.functional.pad(patches.grid(plane).float(), (2, 2, 2, 2))
-            cells.append(torch.nn.functional.max_pool2d(grid[None, None], 3, stride=1)[0, 0].flatten() > 0)
-        sizes = shape.prod(-1)
-        joined = torch.cat(cells) if cells else patches.cells
-        return cls(patches.axes / CELL, patches.low / CELL - 1.0, shape, sizes.cumsum(0) - sizes, joined)
-
-    def holds(self, points: Tensor, plane: Tensor) -> Tensor:
-        """True `[n]` where points `[n, 3]` [m] lie on or within a cell of the surface of their `plane` `[n]`."""
-        cell = ((self.axes[plane] * points[:, None]).sum(-1) - self.low[plane]).floor().long()
-        shape = self.shape[plane]
-        inside = ((cell >= 0) & (cell < shape)).all(-1)
-        place = self.start[plane] + cell[:, 0] * shape[:, 1] + cell[:, 1]
-        return inside & self.cells[torch.where(inside, place, 0)]
+    @cached_property
+    def _doubles(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self.points.double().numpy(), self.plane.numpy(), self.level_db.double().numpy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,92 +174,105 @@ class PointSources:
     @cached_property
     def plan(self) -> Plan:
         """What folding asks of the sources."""
-        return plan_of(self.chain, self.planes.normals, self.planes.offsets, self.sequence)
+        return Plan.of(self.chain, self.sequence, self.planes.normals, self.planes.offsets, self.patches)
+
+    def reaching(self, receivers: Tensor) -> Tensor:
+        """True `[K]` for sources with a way over surface, open or not, to one of the receivers `[n, 3]` [m]."""
+        found = torch.zeros(len(self), dtype=torch.bool)
+        for part in _positions(receivers):
+            found[torch.from_numpy(ways_over(self.plan, part).source)] = True
+        return found
+
+    def gain(self, ways: Ways) -> np.ndarray:
+        """Path gain `[w]`, linear, of open ways."""
+        level_db = self.level_db + self.reflection_db(ways.source, ways.cosine, ways.points)
+        return friis_gain(ways.distance, self.frequency) * 10.0 ** (level_db / 10.0)
+
+    def reflection_db(self, source: np.ndarray, cosine: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Sum `[w]` of 10 log10 Gamma over reflections in `points` `[w, 3, 3]` at `cosine` `[w, 3]` of incidence."""
+        planes = self.plan.sequence[source]
+        laws = self._reflection[planes]  # -1 is the row behind the planes
+        level_db = laws[..., 0] + cosine * (laws[..., 1] + cosine * laws[..., 2])
+        if self.marks is not None:
+            way, step = np.nonzero(planes >= 0)
+            level_db[way, step] += self.marks.at(points[way, step], planes[way, step])
+        return np.minimum(level_db, 0.0).sum(-1)
 
     @cached_property
-    def reach(self) -> Reach | None:
-        """Where the planes have surface, prepared to be asked fast; None for everywhere."""
-        return None if self.patches is None else Reach.of(self.patches)
+    def _reflection(self) -> np.ndarray:
+        """`reflection` and a row `[P + 1, 3]` that changes nothing, for no plane."""
+        return torch.cat((self.reflection, self.reflection.new_zeros(1, 3))).double().numpy()
 
-    def folded(self, receivers: Tensor) -> tuple[Folded, Tensor]:
-        """The broken lines to receivers `[*batch, 3]`, and where all their points lie on surface `[*batch, K]`."""
-        lines = fold(self.plan, receivers)
-        good = lines.possible
-        if self.reach is not None:
-            for step in range(len(self.plan.steps)):
-                plane = self.sequence[:, step]
-                asked = torch.nonzero(good & (plane >= 0), as_tuple=True)
-                good[asked] = self.reach.holds(lines.points[..., step, :][asked], plane[asked[-1]])
-        return lines, good
-
-    def gain(self, source: Tensor, distance: Tensor, cosine: Tensor, points: Tensor) -> Tensor:
-        """Path gain `[n]`, linear, of open ways of `distance` `[n]` [m].
-
-        They are reflected at `cosine` `[n, 3]` of incidence in `points` `[n, 3, 3]`.
-        """
-        level_db = self.level_db + self.reflection_db(source, cosine, points)
-        return friis_gain(distance, self.frequency) * 10.0 ** (level_db / 10.0)
-
-    def reflection_db(self, source: Tensor, cosine: Tensor, points: Tensor) -> Tensor:
-        """Sum `[n]` of 10 log10 Gamma over the reflections of ways as in `gain`."""
-        planes = self.sequence[source]
-        way, step = torch.nonzero(planes >= 0, as_tuple=True)
-        if not len(way):
-            return cosine.new_zeros(len(source))
-        plane, cos = planes[way, step], cosine[way, step]
-        a, b, c = self.reflection[plane].unbind(-1)
-        level_db = a + b * cos + c * cos * cos
-        if self.marks is not None:
-            level_db = level_db + self.marks.at(points[way, step], plane)
-        return cosine.new_zeros(len(source)).index_add_(0, way, level_db.clamp_max(0.0).to(cosine.dtype))
-
-    def transmittance(self, source: Tensor, points: Tensor, receivers: Tensor, obstacles: Obstacles) -> Tensor:
-        """Share `[n]` that passes on the ways from the transmitter over `points` `[n, 3, 3]` to `receivers` `[n, 3]`.
+    def transmittance(self, ways: Ways, receivers: np.ndarray, obstacles: Obstacles) -> np.ndarray:
+        """Share `[w]` that passes on ways to `receivers` `[n, 3]` [m].
 
         The product over the legs of a way; Gaussians of the planes that a leg joins do not stand in its way.
         """
-        longest = len(self.plan.steps)
-        none = torch.full((len(source), 1), -1)
-        stops = torch.cat((self.tx.expand(len(source), 1, 3), points[:, :longest], receivers[:, None]), 1)
-        labels = torch.cat((none, self.sequence[source, :longest], none), 1)
+        longest = int(self.plan.order.max())
+        first = np.broadcast_to(self.plan.chain[0, 0], (len(ways), 1, 3))
+        stops = np.concatenate((first, ways.points[:, :longest], receivers[ways.place, None]), 1, dtype=np.float32)
+        labels = np.full((len(ways), longest + 2), -1)
+        labels[:, 1:-1] = self.plan.sequence[ways.source, :longest]
         known = obstacles.labels is not None
         passed = obstacles.transmittance(  # legs beyond the last go from the receiver to itself, and are free
-            stops[:, :-1].reshape(-1, 3),
-            stops[:, 1:].reshape(-1, 3),
-            skip_start=labels[:, :-1].reshape(-1) if known else None,
-            skip_end=labels[:, 1:].reshape(-1) if known else None,
+            torch.from_numpy(stops[:, :-1].reshape(-1, 3)),
+            torch.from_numpy(stops[:, 1:].reshape(-1, 3)),
+            skip_start=torch.from_numpy(labels[:, :-1].reshape(-1)) if known else None,
+            skip_end=torch.from_numpy(labels[:, 1:].reshape(-1)) if known else None,
         )
-        return passed.reshape(-1, longest + 1).prod(-1)
+        return passed.numpy().reshape(-1, longest + 1).prod(-1)
 
     def rays(self, receiver: Tensor, obstacles: Obstacles) -> Rays:
         """What reaches a receiver at `receiver` `[3]` [m]."""
-        return self.rays_each(receiver[None], obstacles)[0]
+        return self.arrivals(receiver[None], obstacles)[1]
 
     def rays_each(self, receivers: Tensor, obstacles: Obstacles, *, in_sight: Tensor | None = None) -> list[Rays]:
         """What reaches each of the receivers `[n, 3]` [m]; `in_sight` `[n]` decides the line of sight where given."""
-        lines, good = self.folded(receivers)
-        place, source = torch.nonzero(good, as_tuple=True)
-        points = lines.points[place, source]
-        open_way = self.transmittance(source, points, receivers[place], obstacles) > self.open_above
-        if in_sight is not None:
-            open_way = torch.where(source == 0, in_sight[place], open_way)
-        place, source, points = place[open_way], source[open_way], points[open_way]
-        distance, cosine = lines.distance[place, source], lines.cosine[place, source]
-        rays = Rays(
-            source,
-            self.gain(source, distance, cosine, points),
-            lines.arrival[place, source],
-            lines.departure[place, source],
-            distance / SPEED_OF_LIGHT,
-            self.order[source],
-            points,
-        )
-        if len(receivers) == 1:
-            return [rays]
-        return [rays.only(place == number) for number in range(len(receivers))]
+        place, rays = self.arrivals(receivers, obstacles, in_sight=in_sight)
+        counts = torch.bincount(place, minlength=len(receivers)).tolist()
+        parts = zip(*(getattr(rays, name).split(counts) for name in RAY_FIELDS), strict=True)
+        return [Rays(*part) for part in parts]
+
+    def arrivals(
+        self, receivers: Tensor, obstacles: Obstacles, *, in_sight: Tensor | None = None
+    ) -> tuple[Tensor, Rays]:
+        """What reaches any of the receivers `[n, 3]` [m], in their order, and which receiver `[k]` each ray reaches.
+
+        `in_sight` `[n]` decides the line of sight where given.
+        """
+        seen = None if in_sight is None else in_sight.numpy()
+        found, start = [], 0
+        for part in _positions(receivers):
+            ways = ways_over(self.plan, part)
+            open_way = self.transmittance(ways, part, obstacles) > self.open_above
+            if seen is not None:
+                open_way = np.where(ways.source == 0, seen[start:][ways.place], open_way)
+            ways = ways.only(open_way)
+            found.append((torch.from_numpy(ways.place + start), self._rays_of(ways)))
+            start += len(part)
+        if len(found) == 1:
+            return found[0]
+        places, parts = zip(*found, strict=True)
+        return torch.cat(places), Rays(*(torch.cat([getattr(part, name) for part in parts]) for name in RAY_FIELDS))
+
+    def _rays_of(self, ways: Ways) -> Rays:
+        values = (self.gain(ways), ways.arrival, ways.departure, ways.distance / SPEED_OF_LIGHT)
+        power, arrival, departure, delay = (_tensor(value) for value in values)
+        order = torch.from_numpy(self.plan.order[ways.source])
+        return Rays(torch.from_numpy(ways.source), power, arrival, departure, delay, order, _tensor(ways.points))
 
     def sees(self, receivers: Tensor, obstacles: Obstacles) -> Tensor:
         """True `[*batch]` where the line of sight to receivers `[*batch, 3]` is open."""
         flat = receivers.reshape(-1, 3)
         passed = obstacles.transmittance(self.tx.expand_as(flat), flat)
         return (passed > self.open_above).reshape(receivers.shape[:-1])
+
+
+def _positions(receivers: Tensor) -> list[np.ndarray]:
+    """Receivers `[n, 3]` as float64, in parts whose ways fit a cache; one part where there are none."""
+    every = receivers.detach().double().numpy()
+    return [every[start : start + AT_ONCE] for start in range(0, max(1, len(every)), AT_ONCE)]
+
+
+def _tensor(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(values.astype(np.float32))

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from rf3dgs.channel.binning import DIFFUSE
 from rf3dgs.channel.paths import Paths
-from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid, sample_grid
@@ -28,7 +27,6 @@ FLOOR = 1e-12  # of the strongest diffuse pixel: below it the FFT's rounding beg
 EXACT_ALWAYS = 1024  # a receiver with at most so many paths is summed exactly
 EXACT_STRONGEST = 256  # so many of the strongest paths are exact beside the line of sight and mirrors
 NARROWEST = 1.4  # lobe over pixel spacing: below it the sum over pixels loses path gain
-BLOCK = 12  # pixels on a side of the blocks that tell which lobes are near
 
 
 def default_lobe(grid: DirectionGrid) -> float:
@@ -120,7 +118,6 @@ class LobeSum:
         self.whole_sphere = grid.kind == "equirect"
         self.solid_angle = grid.solid_angle.reshape(-1).double()
         self.sphere: _Sphere | None = None
-        self.blocks, self.centres, self.reach = _blocks(grid, self.cut)
 
     def __call__(self, paths: Paths, world_from_device: Tensor) -> Tensor:
         """Sums `[row, col, 5]` (float64) of power, power x delay [s] and power x departure vector of one receiver."""
@@ -138,12 +135,12 @@ class LobeSum:
     def _sum_exactly(self, directions: Tensor, values: Tensor) -> Tensor:
         """Sum every lobe at every pixel within its cut."""
         total = torch.zeros(len(self.directions), CHANNELS, dtype=torch.float64)
-        nearest = math.cos(self.cut) - 1e-6
+        nearest, blocks = math.cos(self.cut) - 1e-6, self.grid.blocks
         step = max(1, 2**21 // max(1, len(self.directions)))
         for start in range(0, len(directions), step):
             part = directions[start : start + step]
-            block, path = torch.nonzero(self.centres @ part.mT >= self.reach[:, None], as_tuple=True)
-            pixel = self.blocks[block]
+            block, path = blocks.near(part, self.cut)
+            pixel = blocks.pixels[block]
             inside = (self.directions[pixel] * part[path, None]).sum(-1) >= nearest
             path = path[:, None].expand_as(pixel)[inside & (pixel >= 0)]
             pixel = pixel[inside & (pixel >= 0)]
@@ -156,27 +153,6 @@ class LobeSum:
                 kernel = kernel * (math.pi / self.sharpness / seen)[path]
             total.index_add_(0, pixel, kernel[:, None] * values[start + path])
         return total.reshape(*self.grid.shape, CHANNELS)
-
-
-def _blocks(grid: DirectionGrid, cut: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels of small blocks of the grid `[block, pixel]` (-1 is none), their middles, and how near a lobe must be.
-
-    A lobe that ends at `cut` [rad] touches a block only where the cosine of the angle to its middle `[block, 3]` is at
-    least `[block]`. A block that goes around the sphere has no middle and is always near.
-    """
-    height, width = grid.shape
-    tall = min(BLOCK, height)
-    number = torch.arange(height * width).reshape(height, width)
-    number = torch.nn.functional.pad(number, (0, -width % BLOCK, 0, -height % tall), value=-1)
-    blocks = number.reshape(number.shape[0] // tall, tall, number.shape[1] // BLOCK, BLOCK)
-    blocks = blocks.transpose(1, 2).reshape(-1, tall * BLOCK)
-    some = torch.where(blocks < 0, blocks[:, :1], blocks)
-    members = grid.directions.reshape(-1, 3)[some]
-    middles = members.mean(1)
-    radius = angle_between(members, middles[:, None].expand_as(members)).amax(1)
-    radius = torch.where(torch.linalg.vector_norm(middles, dim=-1) < 0.01, torch.full_like(radius, math.pi), radius)
-    middles = torch.nn.functional.normalize(middles, dim=-1)
-    return blocks, middles, torch.cos((cut + radius).clamp_max(math.pi)) - 1e-5
 
 
 def _exact(paths: Paths, gain: Tensor) -> Tensor:

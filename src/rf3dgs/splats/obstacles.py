@@ -18,6 +18,7 @@ from rf3dgs.splats.transmittance import segment_transmittance
 
 SOFT_RADIUS = 0.02  # m
 RAYS = 7  # of a soft gate
+FEW = 256  # segments that are answered sooner than other threads wake
 _SOFT_CHUNK = 200_000  # segments
 LARGEST_LABEL = 2**31 - 2
 
@@ -83,7 +84,8 @@ class Obstacles:
             )
         passed = torch.empty(len(start))
         skips = (None if skip is None else skip.clamp(-1, LARGEST_LABEL + 1).int().numpy() for skip in (first, last))
-        self._tree.transmittance(_floats(start), _floats(end), *skips, stop_short, passed.numpy(), thread_count())
+        threads = 1 if len(start) < FEW else thread_count()
+        self._tree.transmittance(_floats(start), _floats(end), *skips, stop_short, passed.numpy(), threads)
         return passed
 
     def soft(

@@ -87,7 +87,7 @@ def _view(one: Spectrum, rays: Rays | None) -> LitView:
     keep = area.clone()
     if rays is not None and len(rays):
         keep = area * ~ruled(one, rays)[1]
-        place, ray, share = rays.shares(one.directions, one.instrument)
+        place, ray, share = rays.shares(one.pose, one.grid, one.instrument)
         known = torch.cat((torch.ones(len(rays), 1), rays.delay[:, None] / NANOSECOND, rays.departure), -1)
         taken = (share[:, None] * known[ray])[:, : channels.shape[-1]].double()
         flat = channels.reshape(-1, channels.shape[-1]).index_add(0, place, -taken)

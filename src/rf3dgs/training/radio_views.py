@@ -56,7 +56,7 @@ def ruled(one: Spectrum, rays: Rays) -> tuple[Tensor, Tensor]:
     """Power `[row, col]` that point sources send into a spectrum `[row, col]`, and the pixels that they rule: where it
     is 30 % of the spectrum's or more, and a lobe around the line of sight.
     """
-    share = rays.picture(one.directions, one.instrument).double()
+    share = rays.picture(one.pose, one.grid, one.instrument).double()
     rule = share >= MASKED_SHARE * one.power
     for arrival in rays.arrival[rays.order == 0]:
         angle = angle_between(one.directions, arrival.expand_as(one.directions))
@@ -75,7 +75,7 @@ def _view(one: Spectrum, window: DbWindow, rays: Rays | None, encoding: PaperEnc
         sent, rule = ruled(one, rays)
         whole, power = ~rule, power - sent
         if has_csi:
-            place, ray, share = rays.shares(one.directions, one.instrument)
+            place, ray, share = rays.shares(one.pose, one.grid, one.instrument)
             late, turned = share * rays.delay[ray], share[:, None] * rays.departure[ray]
             delay = delay.flatten().index_add(0, place, -late.double()).reshape(delay.shape)
             aod = aod.reshape(-1, 3).index_add(0, place, -turned.double()).reshape(aod.shape)

@@ -170,7 +170,8 @@ def fit_marks(found: Glints, reflection: Tensor) -> Marks | None:
     best, most = None, 0.0
     for width in WIDTHS:
         marks = Marks(points, plane, level_db, width)
-        gained = level_db.abs() - (level_db - marks.at(points, plane, leave_out=True)).abs()
+        others = torch.from_numpy(marks.at(points.double().numpy(), plane.numpy(), leave_out=True)).float()
+        gained = level_db.abs() - (level_db - others).abs()
         count = torch.bincount(plane, minlength=len(reflection))
         mean = torch.zeros(len(reflection)).index_add_(0, plane, gained) / count.clamp_min(1)
         worth = (count >= LEAST_MARKS) & (mean > WORTH_DB)

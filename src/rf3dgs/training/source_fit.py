@@ -111,7 +111,7 @@ def with_images(
     kept = [torch.zeros(1, dtype=torch.long)]
     for chunk in torch.arange(1, len(rows)).split(max(1, ROWS_AT_ONCE // len(probes))):
         part = replace(sources, sequence=torch.cat((rows[:1], rows[chunk])))
-        kept.append(chunk[part.folded(probes)[1].any(0)[1:]])
+        kept.append(chunk[part.reaching(probes)[1:]])
     return replace(sources, sequence=rows[torch.cat(kept)])
 
 
