@@ -456,7 +456,7 @@ IMPOSSIBLE = {
     "negative receivers": ("trace lobby --rx.count -2 --out OUT/x.paths", "count from 1"),
     "no photographs": ("photos lobby --count 0 --out OUT/photos", "at least 1"),
     "an array of no elements": ("spectra PATHS --out OUT/x --method capon --array 0x4", "rows x columns"),
-    "noise without elements": ("spectra PATHS --out OUT/x --snr-db 10", "no elements"),
+    "noise without elements": ("spectra PATHS --out OUT/x --snr-db 10", "no array to process"),
     "an unknown scene": ("fit SITE --mesh nowhere --out OUT/x.field", "no scene is named"),
     "no such dataset": ("fit OUT/gone --out OUT/x.field", "there is no dataset folder"),
     "no such field": ("eval OUT/gone SITE --out OUT/r.html", "there is no field"),
