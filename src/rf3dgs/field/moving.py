@@ -35,8 +35,8 @@ def moved(field: "RadioField", tx: Pose, *, order: int = 2) -> "RadioField":
     surface = field.surface
     if not isinstance(surface, LitSurface):
         raise InputError(
-            "moving the transmitter needs a field of the mirror model; this one is of the paper's, whose harmonics hold "
-            'the light of one place. Train it with RadioConfig(model="mirror")'
+            "moving the transmitter needs a field of the mirror model; this one is of the paper's, whose harmonics "
+            'hold the light of one place. Train it with RadioConfig(model="mirror")'
         )
     if tx.batch_shape:
         raise InputError(f"tx must be one pose; got a batch {list(tx.batch_shape)}. Move to each place by itself")
@@ -75,9 +75,9 @@ def _lit(surface: LitSurface, visibility: Tensor, tx: Tensor) -> float:
 
 
 def moved_ambient(means: Tensor, ambient: Tensor, old: Tensor, new: Tensor) -> Tensor:
-    """Delay [ns] and departure vector `[N, 4]` of the ambient part at `means` `[N, 3]` for a transmitter at `new` `[3]`.
+    """Delay [ns] and departure vector `[N, 4]` of the ambient part for a transmitter at `new` `[3]` [m].
 
-    `ambient` is that for `old` `[3]`. The place of the one bounce that explains delay and departure stays where it is,
+    means `[N, 3]` [m]: the Gaussians; `ambient` is what they get from a transmitter at `old` `[3]`. The place of the one bounce that explains delay and departure stays where it is,
     and so does the length of the vector.
     """
     light = SPEED_OF_LIGHT * NANOSECOND
