@@ -77,8 +77,8 @@ def _lit(surface: LitSurface, visibility: Tensor, tx: Tensor) -> float:
 def moved_ambient(means: Tensor, ambient: Tensor, old: Tensor, new: Tensor) -> Tensor:
     """Delay [ns] and departure vector `[N, 4]` of the ambient part for a transmitter at `new` `[3]` [m].
 
-    means `[N, 3]` [m]: the Gaussians; `ambient` is what they get from a transmitter at `old` `[3]`. The place of the one bounce that explains delay and departure stays where it is,
-    and so does the length of the vector.
+    means `[N, 3]` [m]: the Gaussians; `ambient` is what they get from a transmitter at `old` `[3]`. The place of the
+    one bounce that explains delay and departure stays where it is, and so does the length of the vector.
     """
     light = SPEED_OF_LIGHT * NANOSECOND
     straight = means - old
