@@ -168,8 +168,8 @@ def test_shadows_move_with_the_transmitter():
         assert float(surface.visibility[free].mean()) > 0.95
 
 
-def test_laws_stay_and_the_residual_goes(field, there):
-    assert torch.equal(there.surface.laws, field.surface.laws)
+def test_the_lit_laws_stay_and_the_residual_goes(field, there):
+    assert torch.equal(there.surface.laws[:, :3], field.surface.laws[:, :3])
     for name in ("segment_sh", "cell_sh", "level"):
         assert float(getattr(there.surface, name).abs().max()) == 0.0
         assert float(getattr(field.surface, name).abs().max()) > 0.0
@@ -177,6 +177,18 @@ def test_laws_stay_and_the_residual_goes(field, there):
     assert torch.equal(there.bounds, field.bounds)
     assert there.meta["trained with the transmitter at"] == "1.000 1.200 2.400"
     assert there.moved_to(HERE).meta == there.meta
+
+
+def test_the_ambient_level_is_that_of_what_was_dark():
+    divided = room(screen=True)
+    lit_anew = divided.moved_to(HERE).surface
+    dark = replace(lit_anew, laws=LAWS.repeat(6, 1))
+    distance = torch.linalg.vector_norm(dark.means[dark.visibility < 0.1] - HERE.position, dim=-1)
+    expected = float((LAWS[3] + LAWS[4] * 10 * torch.log10(distance / 5.0)).median())
+    moved = replace(divided, surface=dark).moved_to(THERE)
+    assert moved.surface.laws[:, 3].tolist() == pytest.approx([expected] * 6, abs=1e-3)
+    assert float(moved.surface.laws[:, 4].abs().max()) == 0.0
+    assert torch.equal(moved.moved_to(HERE).surface.laws, moved.surface.laws)
 
 
 def test_ambient_waves_keep_the_place_of_their_bounce():

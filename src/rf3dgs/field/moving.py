@@ -26,6 +26,7 @@ LEAST_DB, MOST_SOURCES = 40.0, 200
 OUT_OF_SIGHT = 0.01  # of the usual strongest way: what a probe that only weak ways reach is compared with
 ROWS_AT_ONCE = 400_000
 NEAREST_BOUNCE = 1.0  # m
+UNLIT = 0.1
 LEAST_LIT = 0.05  # of what was lit before
 STRAIGHT = 0.01  # m of detour below which a way is the straight one
 
@@ -52,7 +53,7 @@ def moved(field: "RadioField", tx: Pose, *, order: int = 2) -> "RadioField":
 
 
 def moved_surface(surface: LitSurface, obstacles: Obstacles, tx: Tensor) -> LitSurface:
-    """The surface lit from `tx` `[3]` [m]: shadows baked anew, the laws kept, no residual.
+    """The surface lit from `tx` `[3]` [m]: shadows baked anew, the lit laws kept, one ambient level, no residual.
 
     `obstacles` are the surface's own Gaussians. Raises InputError when hardly anything is lit from its free side.
     """
@@ -65,7 +66,20 @@ def moved_surface(surface: LitSurface, obstacles: Obstacles, tx: Tensor) -> LitS
             f"where it stood {before:.1%}. Is it in a wall, or outside?"
         )
     ambient = moved_ambient(surface.means, surface.ambient, surface.tx, tx)
-    return replace(surface.without_residual(), visibility=visibility, ambient=ambient, tx=tx)
+    laws = surface.laws.clone()
+    laws[:, 3], laws[:, 4] = ambient_level_db(surface), 0.0
+    return replace(surface.without_residual(), visibility=visibility, ambient=ambient, laws=laws, tx=tx)
+
+
+def ambient_level_db(surface: LitSurface) -> float:
+    """The median ambient level [dB] of the Gaussians that the transmitter does not light; of all where it lights all.
+
+    Where the transmitter does light, the ambient law takes up what the lit one misses, and its falloff is that of one
+    side of a site: neither says anything about another place.
+    """
+    level_db = 10 * torch.log10(surface.parts(torch.zeros_like(surface.means))[1])
+    dark = surface.visibility < UNLIT
+    return float((level_db[dark] if bool(dark.any()) else level_db).median())
 
 
 def _lit(surface: LitSurface, visibility: Tensor, tx: Tensor) -> float:
