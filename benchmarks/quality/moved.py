@@ -9,9 +9,10 @@ Ideal spectra, spheres of 180x90. Rows:
     moved                 the mirror model fitted to 40 positions at the old place, `moved_to` the new one
     moved, old residual   the same with the residual that `moved_to` drops
     moved, old shadows    the same with the shadows of the old place
+    moved, then 10        the moved field, refined by the ten measurements at the new place
     never moved           the field of the old place as it is: what moving does at all
-    nearest, idw4         lookups in ten measurements at the new place
-    fitted there          the mirror model fitted to these ten
+    nearest, idw4         lookups in these ten
+    fitted there to 10    the mirror model fitted to these ten
     at home               the field of the old place at 30 other positions there, whole and without its residual
 
 Columns: median and mean of the main peak's error [deg], losses of beams [dB], RMSE and MAE [dB], path gain [dB], delay
@@ -51,6 +52,7 @@ from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
 from rf3dgs.training.config import RadioConfig
 from rf3dgs.training.radio import fit_radio
+from rf3dgs.training.refine import refine_field
 
 TRAIN, MEASURED, JUDGED = 40, 10, 30
 RANGE_DB = 80.0
@@ -134,6 +136,7 @@ def main() -> None:
     field = fit_radio(geometry, train, config)
     print(f"{len(geometry):,} Gaussians, fitted in {time.process_time() - began:.0f} s of CPU time", flush=True)
     rows = variants(field, tx) | {
+        "moved, then 10": refine_field(field.moved_to(tx), measured),
         "nearest of 10": NearestNeighbour(measured),
         "idw4 of 10": InverseDistance(measured),
         "fitted there to 10": fit_radio(geometry, measured, config),

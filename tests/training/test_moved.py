@@ -8,15 +8,19 @@ import torch
 
 from rf3dgs.channel.paths import Paths
 from rf3dgs.core.angles import angle_between
+from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid
+from rf3dgs.field.radiance import Surface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.propagation.room import shoebox
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.surface import sample_mesh
 from rf3dgs.training.config import RadioConfig
 from rf3dgs.training.radio import fit_radio
+from rf3dgs.training.refine import refine_field
 
 SIZE = (9.0, 7.0, 3.2)
 HERE, THERE = Pose([2.1, 1.7, 2.6]), Pose([6.9, 4.8, 2.2])
@@ -34,13 +38,16 @@ def measured(tx: Pose, pose: Pose) -> Spectrum:
     return replace(spectrum, power=spectrum.power + 3e-5 * spectrum.power.amax((-2, -1), keepdim=True))
 
 
-@pytest.fixture(scope="module")
-def field() -> RadioField:
+def room() -> Gaussians:
     corner = [[SIZE[axis] if i >> axis & 1 else 0.0 for axis in range(3)] for i in range(8)]
     quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
     faces = [triangle for a, b, c, d in quads for triangle in ((a, b, c), (a, c, d))]
-    geometry = sample_mesh(torch.tensor(corner), torch.tensor(faces), spacing=0.3, thickness=0.01)
-    return fit_radio(geometry, measured(HERE, Pose.scatter((LOW, HIGH), 16, 0)), RadioConfig(model="mirror"))
+    return sample_mesh(torch.tensor(corner), torch.tensor(faces), spacing=0.3, thickness=0.01)
+
+
+@pytest.fixture(scope="module")
+def field() -> RadioField:
+    return fit_radio(room(), measured(HERE, Pose.scatter((LOW, HIGH), 16, 0)), RadioConfig(model="mirror"))
 
 
 @pytest.fixture(scope="module")
@@ -104,3 +111,29 @@ def test_a_moved_field_shows_the_new_spectrum_better_than_it_did_before(field, m
         )
     )
     assert math.degrees(float(peak.max())) < 2.0
+
+
+def test_measurements_at_the_new_place_make_the_moved_field_better_elsewhere(moved):
+    learned, truth = (measured(THERE, Pose.scatter((LOW, HIGH), count, seed)) for count, seed in ((8, 1), (4, 5)))
+    better = refine_field(moved, learned)
+
+    def error_db(field: RadioField) -> float:
+        shown = field.render(truth.pose, truth.grid, csi=False)
+        return float((shown.gain_db - truth.gain_db).square().mean().sqrt())
+
+    assert error_db(better) < 0.8 * error_db(moved)
+    assert better.sources is moved.sources
+    assert torch.equal(better.surface.laws, moved.surface.laws)
+    assert float(moved.surface.level.abs().max()) == 0.0
+    assert better.meta["refined by positions"] == 8
+
+
+def test_refining_with_strange_spectra_is_refused(field, moved):
+    spectra = measured(THERE, Pose.scatter((LOW, HIGH), 2, 1))
+    with pytest.raises(InputError, match=r"transmitter stands 5.73 m from the field's; use field.moved_to"):
+        refine_field(field, spectra)
+    paper = replace(moved, surface=Surface.bare(room(), tx=THERE.position, window=moved.window))
+    with pytest.raises(InputError, match="refining needs a field of the mirror model"):
+        refine_field(paper, spectra)
+    with pytest.raises(InputError, match="must be of the field's frequency, 60 GHz; got 28 GHz"):
+        refine_field(moved, replace(spectra, frequency=28e9))
