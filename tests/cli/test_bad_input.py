@@ -447,6 +447,8 @@ IMPOSSIBLE = {
     "a field of view beyond a half turn": ("render FIELD --at 7 7 1 --fov-deg 200 --out OUT/s.png", "0 and 180"),
     "a format nobody writes": ("render FIELD --at 7 7 1 --out OUT/s.gif", ".png or .npz"),
     "no paths": ("csi FIELD --at 7 7 1 --strongest 0", "at least 1"),
+    "a paper's field elsewhere": ("csi FIELD --at 7 7 1 --tx 3 3 2", "needs a field of the mirror model"),
+    "a transmitter nowhere": ("render FIELD --at 7 7 1 --tx 3 3 nan --out OUT/s.png", "NaN or infinite"),
     "a file as a folder": ("render FIELD --at 7 7 1 --size 9 9 --out PLY/s.npz", "cannot write"),
     "a folder as a file": ("fit-geometry PICTURES --out OUT --visual.steps 1 --visual.start random", "is a folder"),
     "a field over a file": ("fit-radio PLY SITE --out PLY", "is a file, but a field is a folder"),

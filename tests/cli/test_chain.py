@@ -97,6 +97,23 @@ def test_render_draws_what_csi_lists(box, tmp_path):
     assert float(towards @ truth) > math.cos(math.radians(6.0))
 
 
+def test_the_transmitter_of_a_mirror_field_moves(box, tmp_path, capsys):
+    name, tx = str(tmp_path / "mirror.field"), (-2.0, 3.0, 3.0)
+    fit = ("--mesh", "box", "--mesh-count", "800", "--radio.model", "mirror")
+    assert main(["fit", str(box / "ideal"), "--out", name, *fit]) == 0
+    capsys.readouterr()
+    ask = [name, "--at", *map(str, AT), "--tx", *map(str, tx)]
+    assert main(["csi", *ask, "--format", "json"]) == 0
+    first = max(json.loads(capsys.readouterr().out), key=lambda path: path["gain_db"])
+    distance = math.dist(AT, tx)
+    assert first["delay_ns"] == pytest.approx(distance / SPEED_OF_LIGHT * 1e9, abs=0.01)
+    assert first["aoa_azimuth_deg"] == pytest.approx(math.degrees(math.atan2(tx[1] - AT[1], tx[0] - AT[0])), abs=0.01)
+    assert main(["render", *ask, "--grid", "sphere", "--size", "90", "45", "--out", str(tmp_path / "s.npz")]) == 0
+    with np.load(tmp_path / "s.npz") as content:
+        towards = content["directions"][np.unravel_index(content["gain_db"].argmax(), content["gain_db"].shape)]
+    assert float(towards @ np.subtract(tx, AT)) > distance * math.cos(math.radians(4.0))
+
+
 @pytest.mark.parametrize("name", ["ideal", "capon"])
 def test_eval_scores_the_held_out_positions_and_writes_its_report(box, tmp_path, capsys, name):
     report, numbers = tmp_path / "report.html", tmp_path / "report.json"

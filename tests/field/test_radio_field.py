@@ -209,3 +209,8 @@ def test_errors_say_what_to_do(field):
         replace(field.surface, encoding="polar")
     with pytest.raises(InputError, match="gain_sh must be"):
         replace(field.surface, gain_sh=torch.zeros(3, 16))
+
+
+def test_a_field_of_the_paper_model_does_not_move(field):
+    with pytest.raises(InputError, match="needs a field of the mirror model; this one is of the paper's"):
+        field.moved_to(HERE)

@@ -27,6 +27,8 @@ class Render:
     """A .field folder, or "lobby" for the one that ships with the package."""
     at: tuple[float, float, float]
     """The receiver's position, x y z [m]."""
+    tx: tuple[float, float, float] | None = None
+    """Where the transmitter stands now [m], if elsewhere than in training; for fields of the mirror model."""
     out: Path = Path("spectrum.png")
     """What to write: .png is a picture with a scale, .npz holds gain_db, delay and aod in physical units."""
     towards: tuple[float, float, float] | None = None
@@ -47,7 +49,7 @@ class Render:
 
         if self.out.suffix not in (".png", ".npz"):
             raise InputError(f"--out must end in .png or .npz; got {self.out}")
-        field = open_field(self.field)
+        field = moved_field(open_field(self.field), self.tx)
         if self.grid == "sphere":
             grid = equirect_grid(*(self.size or (360, 180)))
             pose = Pose(self.at) if self.towards is None else Pose.look_at(self.at, self.towards)
@@ -90,6 +92,8 @@ class Csi:
     """A .field folder, or "lobby" for the one that ships with the package."""
     at: tuple[float, float, float]
     """The receiver's position, x y z [m]."""
+    tx: tuple[float, float, float] | None = None
+    """Where the transmitter stands now [m], if elsewhere than in training; for fields of the mirror model."""
     strongest: int = 8
     """How many paths."""
     format: Format = "text"
@@ -105,7 +109,7 @@ class Csi:
 
         if self.strongest < 1:
             raise InputError(f"--strongest must be at least 1; got {self.strongest}")
-        field = open_field(self.field)
+        field = moved_field(open_field(self.field), self.tx)
         pose = Pose.look_at(self.at, field.tx.position)
         columns = path_columns(field.paths(pose, strongest=self.strongest))
         if self.format == "mat":
@@ -145,6 +149,13 @@ class View:
         out(f"{viewer.url}   (Ctrl+C ends)")
         viewer.wait(self.seconds)
         return 0
+
+
+def moved_field(field: "RadioField", tx: tuple[float, float, float] | None) -> "RadioField":
+    """The field with its transmitter at `tx` [m]; as it is for None."""
+    from rf3dgs.core.frames import Pose
+
+    return field if tx is None else field.moved_to(Pose(tx))
 
 
 def path_columns(paths: "Paths") -> dict[str, list[float]]:

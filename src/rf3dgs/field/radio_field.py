@@ -140,6 +140,18 @@ class RadioField:
         """The surface alone."""
         return replace(self, sources=None)
 
+    def moved_to(self, tx: Pose, *, order: int = 2) -> "RadioField":
+        """The field with its transmitter at `tx`, one pose, without any new measurement; mirror model only.
+
+        Shadows, the lit part's geometry and mirror images up to `order` reflections are computed anew; laws,
+        reflections and the gate's threshold are kept; the residual is dropped. docs/how-to/moving-transmitter.md says
+        what becomes of each part. Raises InputError for a field of the paper's model, and for a place from which no
+        surface is lit.
+        """
+        from rf3dgs.field.moving import moved
+
+        return moved(self, tx, order=order)
+
     def save(self, path: str | Path) -> None:
         """Write the folder `path` (NAME.field); see `field.io.save_field`."""
         from rf3dgs.field.io import save_field

@@ -22,6 +22,7 @@ KINDS = {
     "mark_points": torch.float32,
     "mark_plane": torch.int16,
     "mark_level_db": torch.float32,
+    "mirrors": torch.bool,
 }
 PREFIX = "source_"
 
@@ -39,6 +40,7 @@ def source_record(sources: PointSources | None) -> dict[str, Any] | None:
         "marks": 0 if sources.marks is None else len(sources.marks.points),
         "mark_width": 0.0 if sources.marks is None else sources.marks.width,
         "patches": sources.patches is not None,
+        "mirrors": sources.mirrors is not None,
     }
 
 
@@ -54,6 +56,8 @@ def source_tensors(sources: PointSources | None) -> dict[str, Tensor]:
     }
     if sources.patches is not None:
         tensors |= {f"patch_{name}": tensor for name, tensor in sources.patches.tensors().items()}
+    if sources.mirrors is not None:
+        tensors["mirrors"] = sources.mirrors
     if sources.marks is not None:
         marks = sources.marks
         tensors |= {"mark_points": marks.points, "mark_plane": marks.plane, "mark_level_db": marks.level_db}
@@ -94,6 +98,8 @@ def sources_of(record: Any, tensors: Mapping[str, Tensor], frequency: float) -> 
         }
     if marked:
         shapes |= {"mark_points": (marked, 3), "mark_plane": (marked,), "mark_level_db": (marked,)}
+    if record.get("mirrors", False):  # of before transmitters could move, fields have none
+        shapes |= {"mirrors": (planes,)}
     found = {name: _tensor(tensors, name, shape) for name, shape in shapes.items()}
     patches = None
     if record["patches"]:
@@ -118,6 +124,7 @@ def sources_of(record: Any, tensors: Mapping[str, Tensor], frequency: float) -> 
         level_db,
         open_above,
         marks,
+        found.get("mirrors"),
     )
 
 

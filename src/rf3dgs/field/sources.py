@@ -116,7 +116,8 @@ class PointSources:
     reflection `[P, 3]`: a, b and c of 10 log10 Gamma = a + b cos + c cos^2 at the angle of incidence, at most 0 dB.
     sequence `[K, 3]`: the planes of each source in the order from the transmitter, -1 beyond the last; the first row is
     the line of sight, all -1. open_above: the transmittance of a way above which it is open. marks: where planes
-    reflect otherwise, or None.
+    reflect otherwise, or None. mirrors `[P]`: False for planes that were found to mirror nothing, or None where nobody
+    knows; it decides in which planes images are sought for another transmitter.
     """
 
     tx: Tensor
@@ -128,6 +129,7 @@ class PointSources:
     level_db: float = 0.0
     open_above: float = 0.1
     marks: Marks | None = None
+    mirrors: Tensor | None = None
 
     def __post_init__(self) -> None:
         count = len(self.planes)
@@ -135,6 +137,8 @@ class PointSources:
             raise InputError(f"tx must be three coordinates in metres; got {list(self.tx.shape)}")
         if self.reflection.shape != (count, 3):
             raise InputError(f"reflection must be [{count}, 3], a row a plane; got {list(self.reflection.shape)}")
+        if self.mirrors is not None and self.mirrors.shape != (count,):
+            raise InputError(f"mirrors must be [{count}], one for each plane; got {list(self.mirrors.shape)}")
         rows = self.sequence
         if rows.dim() != 2 or rows.shape[1:] != (HIGHEST_ORDER,) or not len(rows) or bool((rows[0] >= 0).any()):
             raise InputError(

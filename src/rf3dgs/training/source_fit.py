@@ -7,7 +7,8 @@ from torch import Tensor
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.field.images import HIGHEST_ORDER, sequences
+from rf3dgs.field.images import HIGHEST_ORDER
+from rf3dgs.field.moving import with_images as images_among
 from rf3dgs.field.sources import PointSources, Rays
 from rf3dgs.geometry import Surfaces
 from rf3dgs.spectra.spectrum import Spectrum
@@ -20,7 +21,6 @@ from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, re
 
 PROBES = 150
 PROBE_MARGIN = 0.5
-ROWS_AT_ONCE = 400_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,22 +97,9 @@ def with_images(
 
     Planes that are `silent` `[P]` mirror nothing.
     """
-    assert sources.patches is not None
-    areas = sources.patches.areas
     if silent is not None:
-        areas = torch.where(silent, -1.0, areas)
-    largest = areas.argsort(descending=True, stable=True)[: config.planes]
-    largest = largest[areas[largest] >= 0]
-    rows = sequences(len(largest), min(config.order, 2))
-    if config.order >= 3:
-        rows = torch.cat((rows, sequences(0, 0, third=torch.arange(min(config.largest, len(largest))))[1:]))
-    if len(largest):
-        rows = torch.where(rows >= 0, largest[rows.clamp_min(0)], -1)
-    kept = [torch.zeros(1, dtype=torch.long)]
-    for chunk in torch.arange(1, len(rows)).split(max(1, ROWS_AT_ONCE // len(probes))):
-        part = replace(sources, sequence=torch.cat((rows[:1], rows[chunk])))
-        kept.append(chunk[part.reaching(probes)[1:]])
-    return replace(sources, sequence=rows[torch.cat(kept)])
+        sources = replace(sources, mirrors=~silent)
+    return images_among(sources, probes, order=config.order, planes=config.planes, largest=config.largest)
 
 
 def _known(direct: PointSources, surfaces: Surfaces) -> PointSources:

@@ -1,0 +1,274 @@
+"""Laws of a field whose transmitter moves, in a room whose walls are known exactly; the shoebox tracer is the truth."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from rf3dgs.channel.paths import Paths
+from rf3dgs.core.angles import angle_between
+from rf3dgs.core.errors import InputError
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.units import SPEED_OF_LIGHT
+from rf3dgs.field.images import sequences
+from rf3dgs.field.io import load_field
+from rf3dgs.field.lit import LitSurface
+from rf3dgs.field.moving import moved_ambient
+from rf3dgs.field.radiance import bounce
+from rf3dgs.field.radio_field import RadioField
+from rf3dgs.field.sources import PointSources
+from rf3dgs.geometry import Patches, Planes
+from rf3dgs.propagation.room import shoebox
+from rf3dgs.spectra.codec import DbWindow
+from rf3dgs.spectra.spectrum import Instrument
+from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.splats.surface import sample_mesh
+
+SIZE = torch.tensor([6.0, 5.0, 3.0])
+HERE, THERE = Pose([1.0, 1.2, 2.4]), Pose([4.8, 1.1, 2.2])
+GAMMA_DB = (-6.0, -9.0, -12.0, -7.0, -10.0, -8.0)
+SCREEN = 3.0  # the screen's place in x [m]; it reaches from y = 0 to 2.5 and from the floor to the ceiling
+LAWS = torch.tensor([-60.0, 0.7, 4.0, -90.0, -1.5])
+
+
+def box(low: Tensor, high: Tensor) -> Gaussians:
+    corner = [[float(high[axis] if i >> axis & 1 else low[axis]) for axis in range(3)] for i in range(8)]
+    quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    faces = [triangle for a, b, c, d in quads for triangle in ((a, b, c), (a, c, d))]
+    return sample_mesh(torch.tensor(corner), torch.tensor(faces), spacing=0.2, thickness=0.01)
+
+
+def walls() -> tuple[Planes, Patches]:
+    """The six walls in the order of the shoebox tracer, with surface everywhere."""
+    normals, offsets, points = [], [], []
+    for axis in range(3):
+        for high in (0, 1):
+            spots = [torch.arange(0.05, float(SIZE[other]), 0.1) for other in range(3)]
+            spots[axis] = SIZE[axis : axis + 1] * high
+            normals.append(torch.eye(3)[axis] * (1.0 - 2.0 * high))
+            offsets.append(SIZE[axis] * high * (1.0 - 2.0 * high))
+            points.append(torch.cartesian_prod(*spots))
+    planes = Planes(torch.stack(normals), torch.stack(offsets))
+    return planes, Patches.of(planes, points)
+
+
+def room(*, screen: bool = False) -> RadioField:
+    """A field with the transmitter HERE, whose walls are mirrors of known gain."""
+    shell = box(torch.zeros(3), SIZE)
+    planes, patches = walls()
+    distance = (shell.means @ planes.normals.mT - planes.offsets).abs()
+    plane_of, normals = distance.argmin(-1), planes.normals[distance.argmin(-1)]
+    if screen:
+        added = box(torch.tensor([SCREEN - 0.02, 0.0, 0.0]), torch.tensor([SCREEN + 0.02, 2.5, 3.0]))
+        side = (added.means[:, :1] - SCREEN).sign() * torch.eye(3)[:1]
+        shell = Gaussians.join([shell, added])
+        plane_of = torch.cat((plane_of, torch.full((len(added),), -1)))
+        normals = torch.cat((normals, side))
+    count, generator = len(shell), torch.Generator().manual_seed(0)
+    surface = LitSurface(
+        means=shell.means,
+        quats=shell.quats,
+        log_scales=shell.log_scales,
+        logit_opacities=shell.logit_opacities,
+        normals=normals,
+        visibility=torch.ones(count),
+        segment_of=plane_of.clamp_min(0),
+        cell_of=torch.zeros(count, dtype=torch.long),
+        laws=LAWS.repeat(6, 1),
+        segment_sh=torch.randn(6, 16, generator=generator),
+        cell_sh=torch.randn(1, 16, generator=generator),
+        level=torch.randn(count, generator=generator),
+        ambient=bounce(shell.means, HERE.position),
+        tx=HERE.position,
+        window=DbWindow(-140.0, -60.0),
+    )
+    sources = PointSources(
+        HERE.position,
+        60e9,
+        planes,
+        patches,
+        sequences(6, 1),
+        torch.tensor([[level, 0.0, 0.0] for level in GAMMA_DB]),
+        mirrors=torch.ones(6, dtype=torch.bool),
+    )
+    return RadioField(
+        surface=surface,
+        sources=sources,
+        solidity=shell.opacities,
+        frequency=60e9,
+        instrument=Instrument.gaussian(math.radians(3)),
+        tx=HERE,
+        bounds=torch.tensor([[0.7, 0.7, 0.7], [5.3, 4.3, 2.3]]),
+        colour=torch.full((count, 3), 100, dtype=torch.uint8),
+        plane_of=plane_of,
+    )
+
+
+def receivers(count: int) -> Pose:
+    return Pose.scatter(((0.7, 0.7, 0.7), (5.3, 4.3, 2.3)), count, 5)
+
+
+def traced(tx: Pose, pose: Pose) -> Paths:
+    return shoebox(SIZE.tolist(), tx, pose, 60e9, 2, [-(10 ** (level / 20)) for level in GAMMA_DB])
+
+
+@pytest.fixture(scope="module")
+def field() -> RadioField:
+    return room()
+
+
+@pytest.fixture(scope="module")
+def there(field) -> RadioField:
+    return field.moved_to(THERE)
+
+
+def test_a_moved_field_has_the_mirror_paths_of_the_new_place_exactly(there):
+    pose = receivers(12)
+    truth, found = traced(THERE, pose), there.paths(pose, strongest=60, parts="sources")
+    for number in range(len(pose)):
+        real = truth.valid[number]
+        assert int(found.valid[number].sum()) == int(real.sum())
+        for path in torch.nonzero(real).squeeze(-1).tolist():
+            apart = angle_between(found.aoa[number], truth.aoa[number, path].expand_as(found.aoa[number]))
+            best = int(torch.where(found.valid[number], apart, torch.inf).argmin())
+            # Positions of some metres in float32: 1e-6 rad, a tenth of a picosecond.
+            assert float(apart[best]) < 1e-5
+            assert abs(float(found.delay[number, best] - truth.delay[number, path])) < 1e-13
+            left = angle_between(found.aod[number, best], truth.aod[number, path])
+            assert float(left) < 1e-5
+            level_db = 10 * torch.log10(found.path_gain[number, best] / truth.path_gain[number, path])
+            assert abs(float(level_db)) < 1e-3
+    assert there.tx is THERE
+    assert torch.equal(there.sources.tx, THERE.position)
+
+
+def test_the_images_of_a_place_do_not_depend_on_where_the_transmitter_came_from(field, there):
+    back, stayed = there.moved_to(HERE), field.moved_to(HERE)
+    for name in ("tx", "sequence", "mirrors"):
+        assert torch.equal(getattr(back.sources, name), getattr(stayed.sources, name)), name
+    assert torch.equal(back.surface.visibility, stayed.surface.visibility)
+    trained = {tuple(row) for row in field.sources.sequence.tolist()}
+    assert trained <= {tuple(row) for row in back.sources.sequence.tolist()}
+
+
+def test_shadows_move_with_the_transmitter():
+    divided = room(screen=True)
+    for tx in (HERE, THERE):
+        surface = divided.moved_to(tx).surface
+        way = surface.means - tx.position
+        share = (SCREEN - tx.position[0]) / way[:, 0]
+        crossing = tx.position[1] + share * way[:, 1]
+        beyond = (share > 0) & (share < 1) & (divided.plane_of >= 0)
+        behind, free = beyond & (crossing < 2.2), beyond & (crossing > 2.8)
+        assert min(int(behind.sum()), int(free.sum())) > 200
+        # The screen's two sides of opacity 0.98 let through a few per cent between their Gaussians.
+        assert float(surface.visibility[behind].mean()) < 0.05
+        assert float(surface.visibility[free].mean()) > 0.95
+
+
+def test_the_lit_laws_stay_and_the_residual_goes(field, there):
+    assert torch.equal(there.surface.laws[:, :3], field.surface.laws[:, :3])
+    for name in ("segment_sh", "cell_sh", "level"):
+        assert float(getattr(there.surface, name).abs().max()) == 0.0
+        assert float(getattr(field.surface, name).abs().max()) > 0.0
+    assert there.sources.open_above == field.sources.open_above
+    assert torch.equal(there.bounds, field.bounds)
+    assert there.meta["trained with the transmitter at"] == "1.000 1.200 2.400"
+    assert there.moved_to(HERE).meta == there.meta
+
+
+def test_the_ambient_level_is_that_of_what_was_dark():
+    divided = room(screen=True)
+    lit_anew = divided.moved_to(HERE).surface
+    dark = replace(lit_anew, laws=LAWS.repeat(6, 1))
+    distance = torch.linalg.vector_norm(dark.means[dark.visibility < 0.1] - HERE.position, dim=-1)
+    expected = float((LAWS[3] + LAWS[4] * 10 * torch.log10(distance / 5.0)).median())
+    moved = replace(divided, surface=dark).moved_to(THERE)
+    assert moved.surface.laws[:, 3].tolist() == pytest.approx([expected] * 6, abs=1e-3)
+    assert float(moved.surface.laws[:, 4].abs().max()) == 0.0
+    assert torch.equal(moved.moved_to(HERE).surface.laws, moved.surface.laws)
+
+
+def test_ambient_waves_keep_the_place_of_their_bounce():
+    generator = torch.Generator().manual_seed(4)
+    means, places = SIZE * torch.rand(2, 200, 3, generator=generator)
+    old, new = HERE.position, THERE.position
+    length = torch.rand(200, 1, generator=generator)
+
+    def of(tx: Tensor) -> Tensor:
+        first = places - tx
+        legs = torch.linalg.vector_norm(first, dim=-1) + torch.linalg.vector_norm(means - places, dim=-1)
+        departure = length * torch.nn.functional.normalize(first, dim=-1)
+        return torch.cat((legs[:, None] / SPEED_OF_LIGHT * 1e9, departure), -1)
+
+    # Near the straight way the bounce's distance is the quotient of two small numbers.
+    far = torch.linalg.vector_norm(places - old, dim=-1) > 1.0
+    bent = of(old)[:, 0] * 1e-9 * SPEED_OF_LIGHT - torch.linalg.vector_norm(means - old, dim=-1) > 0.2
+    sure = far & bent
+    assert int(sure.sum()) > 100
+    torch.testing.assert_close(moved_ambient(means, of(old), old, new)[sure], of(new)[sure], atol=2e-3, rtol=0)
+
+
+def test_what_came_straight_still_comes_straight(field, there):
+    torch.testing.assert_close(there.surface.ambient, bounce(field.surface.means, THERE.position), atol=1e-4, rtol=0)
+
+
+def test_silent_planes_mirror_nothing_at_the_new_place_either(field):
+    mirrors = torch.tensor([True, True, True, True, False, True])
+    silent = replace(field, sources=replace(field.sources, mirrors=mirrors)).moved_to(THERE)
+    assert not bool((silent.sources.sequence == 4).any())
+    forgotten = replace(field, sources=replace(field.sources, sequence=sequences(6, 1)[:5], mirrors=None))
+    moved = forgotten.moved_to(THERE).sources
+    assert moved.mirrors.tolist() == [True] * 4 + [False] * 2
+    assert set(moved.sequence.unique().tolist()) == {-1, 0, 1, 2, 3}
+
+
+def test_the_order_says_how_many_reflections_are_sought(field):
+    for order in (0, 1, 2, 3):
+        assert int(field.moved_to(THERE, order=order).sources.order.max()) == order
+
+
+def test_a_field_without_planes_or_sources_moves_too(field):
+    line = PointSources.line_of_sight(HERE.position, field.frequency, open_above=0.3)
+    moved = replace(field, sources=line, plane_of=None).moved_to(THERE)
+    assert torch.equal(moved.sources.tx, THERE.position)
+    assert moved.sources.open_above == 0.3
+    assert field.without_sources().moved_to(THERE).sources is None
+
+
+def test_a_moved_field_comes_back_from_disk_and_moves_on(there, tmp_path):
+    there.save(tmp_path / "there.field")
+    loaded = load_field(tmp_path / "there.field")
+    pose = receivers(3)
+    before, after = there.paths(pose, parts="sources"), loaded.paths(pose, parts="sources")
+    torch.testing.assert_close(after.delay, before.delay)
+    torch.testing.assert_close(after.path_gain, before.path_gain)
+    assert torch.equal(loaded.tx.position, THERE.position)
+    assert torch.equal(loaded.surface.tx, THERE.position)
+    torch.testing.assert_close(loaded.surface.visibility, there.surface.visibility, atol=1 / 510 + 1e-6, rtol=0)
+    assert loaded.meta == there.meta
+    assert torch.equal(loaded.sources.mirrors, there.sources.mirrors)
+    assert torch.equal(loaded.moved_to(HERE).sources.sequence, there.moved_to(HERE).sources.sequence)
+
+
+@pytest.mark.parametrize(
+    ("where", "message"),
+    [
+        (
+            dict(tx=Pose([20.0, 2.5, 1.5])),
+            r"free space of this field; from \(20.00, 2.50, 1.50\) m 2\.\d% of the surface is lit",
+        ),
+        (dict(tx=Pose(torch.ones(2, 3))), r"tx must be one pose; got a batch \[2\]"),
+        (dict(tx=THERE, order=4), "order must be from 0 to 3; got 4"),
+    ],
+)
+def test_places_that_cannot_be_are_refused(field, where, message):
+    with pytest.raises(InputError, match=message):
+        field.moved_to(**where)
+
+
+def test_mirrors_must_fit_the_planes(field):
+    with pytest.raises(InputError, match=r"mirrors must be \[6\], one for each plane; got \[5\]"):
+        replace(field.sources, mirrors=torch.ones(5, dtype=torch.bool))
