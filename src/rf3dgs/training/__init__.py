@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rf3dgs.training.loop import train as train
     from rf3dgs.training.photographs import render_photo as render_photo
     from rf3dgs.training.radio import fit_radio as fit_radio
+    from rf3dgs.training.uncertainty_fit import fit_uncertainty as fit_uncertainty
     from rf3dgs.training.visual import fit_geometry as fit_geometry
 
 __all__ = [  # noqa: RUF022 (reading order)
@@ -21,6 +22,7 @@ __all__ = [  # noqa: RUF022 (reading order)
     "render_photo",
     "RadioConfig",
     "fit_radio",
+    "fit_uncertainty",
     "train",
     "TrainingStopped",
     "State",
@@ -35,6 +37,7 @@ __getattr__, __dir__ = lazy_names(
         "render_photo": ".photographs",
         "RadioConfig": ".config",
         "fit_radio": ".radio",
+        "fit_uncertainty": ".uncertainty_fit",
         "train": ".loop",
         "TrainingStopped": ".loop",
         "State": ".checkpoint",
