@@ -142,7 +142,7 @@ def errors(field: RadioField, truth: Spectrum) -> tuple[Tensor, Tensor]:
 
 
 def path_errors(field: RadioField, truth: Spectrum) -> tuple[Tensor, Tensor]:
-    """|error| and standard deviation `[path]` [dB] of the spectrum's level in the pixel of each of the field's paths."""
+    """|error| and standard deviation `[path]` [dB] of the level in the pixel of each of the field's paths."""
     paths = field.paths(truth.pose, strongest=8)
     std = field.uncertainty_of(paths)
     shown = field.render(truth.pose, truth.grid, csi=False)

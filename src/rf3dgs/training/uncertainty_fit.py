@@ -13,10 +13,11 @@ from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.field.lit import BLENDING, LitSurface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.field.sources import PointSources, Rays
-from rf3dgs.field.uncertainty import NUMBERS, ONE_STD, SHARES, Uncertainty, floor_db, numbers_of
+from rf3dgs.field.uncertainty import NUMBERS, SHARES, Uncertainty, floor_db, numbers_of
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.rasterize import rasterize
+from rf3dgs.training.calibration import calibrate
 from rf3dgs.training.line_of_sight import fit_line_of_sight
 from rf3dgs.training.lit_fit import Scattering, fit_laws, refine_residual
 from rf3dgs.training.lit_views import LitView, Observations, lit_views, observe
@@ -29,7 +30,6 @@ SHRINK = 200.0  # [pixel]; as if a cell's segment, and a segment's surface, had 
 FARTHEST_DB = 30.0
 LEAST_SEEN = 0.5  # [pixel]; a position saw a cell that decides as much of its picture
 MOST = 300_000
-STEPS = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,57 +92,6 @@ def folds_of(positions: Tensor, *, seed: int) -> list[list[int]]:
     along = positions[:, longest].argsort(stable=True)
     parts = (*order.tensor_split(RANDOM_FOLDS), *along.tensor_split(STRIPS))
     return [part.sort().values.tolist() for part in parts]
-
-
-def calibrate(numbers: Tensor, error_db: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights `[F]` and widths `[7]` for errors `[n]` [dB], which count `[n]`, of pixels with `numbers` `[n, F]`.
-
-    The weights w minimise the sum of counts (w . x + |error| exp(-w . x)), a convex function, with all but the first
-    at least 0; the first is then such that 68.3 % of the errors lie within exp(w . x). Widths are quantiles.
-    """
-    x, size, counts = numbers.double(), error_db.double().abs(), counts.double() / counts.double().sum()
-    free = torch.ones(x.shape[1], dtype=torch.bool)
-    while True:
-        weights = torch.zeros(x.shape[1], dtype=torch.float64)
-        weights[free] = _minimum(x[:, free], size, counts)
-        negative = weights[1:] < 0
-        if not bool(negative.any()):
-            break
-        free[1 + int(torch.where(negative, weights[1:] * x[:, 1:].std(0), 0.0).argmin())] = False
-    ratio, order = (size / torch.exp(x @ weights)).sort()
-    below = counts[order].cumsum(0)
-    widths = ratio[torch.searchsorted(below, torch.tensor(SHARES, dtype=torch.float64)).clamp_max(len(ratio) - 1)]
-    unit = widths[ONE_STD].clamp_min(1e-6)
-    weights[0] += torch.log(unit)
-    return weights.float(), (widths / unit).float()
-
-
-def _minimum(x: Tensor, size: Tensor, counts: Tensor) -> Tensor:
-    """The weights `[F]` of `calibrate` without bounds, by damped Newton steps."""
-    weights = torch.zeros(x.shape[1], dtype=torch.float64)
-    weights[0] = torch.log((counts * size).sum().clamp_min(1e-6))
-    ridge = 1e-6 * torch.eye(len(weights), dtype=torch.float64)
-
-    def cost(trial: Tensor) -> Tensor:
-        log_std = x @ trial
-        return (counts * (log_std + size * torch.exp(-log_std))).sum() + 0.5 * trial @ ridge @ trial
-
-    best = cost(weights)
-    for _ in range(STEPS):
-        ratio = size * torch.exp(-(x @ weights))
-        slope = (counts * (1 - ratio)) @ x + ridge @ weights
-        step = torch.linalg.solve((x * (counts * ratio)[:, None]).mT @ x + ridge, slope)
-        for _ in range(20):
-            now = cost(weights - step)
-            if bool(now <= best):
-                break
-            step = 0.5 * step
-        else:
-            break
-        weights, gained, best = weights - step, best - now, now
-        if float(gained) < 1e-10:
-            break
-    return weights
 
 
 @dataclass(frozen=True, eq=False)
