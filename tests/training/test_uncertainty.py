@@ -178,7 +178,7 @@ def test_calibration_finds_the_widths_of_laplace_errors():
     sign = torch.rand(40_000, generator=generator) - 0.5
     scale = torch.exp(0.5 + 1.5 * x[:, 1] - 1.0 * x[:, 2])
     error = -scale * sign.sign() * torch.log1p(-2 * sign.abs())
-    weights, widths = calibrate(x, error, torch.ones(40_000))
+    weights, widths = calibrate(x, error, torch.ones(40_000), signed=1)
     # Standard errors of the slopes are 0.02; one that would narrow is left out.
     assert float(weights[1]) == pytest.approx(1.5, abs=0.1)
     assert float(weights[2]) == 0.0

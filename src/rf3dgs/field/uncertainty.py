@@ -1,12 +1,12 @@
 """How far a field's levels may be off, told by what was learned about its errors where nobody had measured.
 
-Nine numbers of a pixel (`NUMBERS`) give its standard deviation in dB,
+Ten numbers of a pixel (`NUMBERS`) give its standard deviation in dB,
 
     std = exp(w . x)
 
-with weights w that only widen, fitted to errors at positions that were left out (`training.uncertainty_fit`).
-Widths of other shares than 68.3 % are multiples of it, counted at the same places: errors have longer tails than a
-normal distribution. See docs/how-to/uncertainty.md.
+with weights w that, but for the first `SIGNED`, only widen, fitted to errors at positions that were left out
+(`training.uncertainty_fit`). Widths of other shares than 68.3 % are multiples of it, counted at the same places: errors
+have longer tails than a normal distribution. See docs/how-to/uncertainty.md.
 """
 
 import math
@@ -28,7 +28,8 @@ from rf3dgs.splats.rasterize import rasterize
 if TYPE_CHECKING:
     from rf3dgs.field.radio_field import RadioField
 
-NUMBERS = ("level", "spread", "away", "turn", "hole", "edge", "silhouette", "gate", "dark")
+NUMBERS = ("level", "points", "spread", "away", "turn", "hole", "edge", "silhouette", "gate", "dark")
+SIGNED = 2
 SHARES = (0.25, 0.5, 0.6827, 0.8, 0.9, 0.95, 0.99)
 """Shares of errors whose widths are known, in units of the standard deviation."""
 ONE_STD = 2
@@ -44,7 +45,7 @@ class Uncertainty:
 
     spread_db `[C]`: root mean square of errors, where nobody had measured, of each cell of the surface. source_db
     `[P + 1]`: of ways over each plane, the straight way last. receivers `[V, 3]` [m]: the training positions. seen
-    `[C, V]`: which of them saw a cell. spacing [m]: median distance between neighbours among them. weights `[9]`: of
+    `[C, V]`: which of them saw a cell. spacing [m]: median distance between neighbours among them. weights `[10]`: of
     `NUMBERS`. widths `[7]`: of `SHARES`, in standard deviations.
     """
 
@@ -72,7 +73,7 @@ class Uncertainty:
             raise InputError(f"the spacing of the training positions must be positive; got {self.spacing} m")
 
     def std_db(self, numbers: Tensor) -> Tensor:
-        """The standard deviation `[*]` [dB] of pixels whose `NUMBERS` are `[*, 9]`."""
+        """The standard deviation `[*]` [dB] of pixels whose `NUMBERS` are `[*, 10]`."""
         return torch.exp(numbers @ self.weights.to(numbers.dtype))
 
     def width(self, share: float | None) -> float:
@@ -108,7 +109,7 @@ class Uncertainty:
 
 
 def numbers_of(field: "RadioField", doubt: Uncertainty, pose: Pose, grid: DirectionGrid) -> Tensor:
-    """`NUMBERS` `[row, col, 9]` of one pose's pixels, by `doubt` about the `field`; see docs/how-to/uncertainty.md."""
+    """`NUMBERS` `[row, col, 10]` of one pose's pixels, by `doubt` about the `field`; see docs/how-to/uncertainty.md."""
     if grid.kind == "list":
         rows = max(8, math.ceil(2 * math.pi / field.instrument.lobe))
         sphere = equirect_grid(2 * rows, rows)
@@ -136,6 +137,7 @@ def numbers_of(field: "RadioField", doubt: Uncertainty, pose: Pose, grid: Direct
     jump = _steps(torch.log(torch.where(reached, depth, 1.0)), grid.kind == "equirect")
     columns = (
         torch.ones_like(total),
+        ways.power / lit,
         torch.log(variance.sqrt().clamp_min(LEAST_SPREAD_DB)),
         torch.full_like(total, math.log1p(doubt.away(receiver))),
         torch.log1p(turn / 0.1),

@@ -3,27 +3,28 @@
 import torch
 from torch import Tensor
 
-from rf3dgs.field.uncertainty import ONE_STD, SHARES
+from rf3dgs.field.uncertainty import ONE_STD, SHARES, SIGNED
 
 STEPS = 40
 HALVINGS = 20
 
 
-def calibrate(numbers: Tensor, error_db: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+def calibrate(numbers: Tensor, error_db: Tensor, counts: Tensor, *, signed: int = SIGNED) -> tuple[Tensor, Tensor]:
     """Weights `[F]` and widths `[7]` for errors `[n]` [dB], which count `[n]`, of pixels with `numbers` `[n, F]`.
 
     The weights w minimise the sum of counts (w . x + |error| exp(-w . x)), a convex function, with all but the first
-    at least 0; the first is then such that 68.3 % of the errors lie within exp(w . x). Widths are quantiles.
+    `signed` at least 0; the first is then such that 68.3 % of the errors lie within exp(w . x). Widths are quantiles.
     """
     x, size, counts = numbers.double(), error_db.double().abs(), counts.double() / counts.double().sum()
     free = torch.ones(x.shape[1], dtype=torch.bool)
     while True:
         weights = torch.zeros(x.shape[1], dtype=torch.float64)
         weights[free] = _minimum(x[:, free], size, counts)
-        negative = weights[1:] < 0
+        negative = weights[signed:] < 0
         if not bool(negative.any()):
             break
-        free[1 + int(torch.where(negative, weights[1:] * x[:, 1:].std(0), 0.0).argmin())] = False
+        effect = weights[signed:] * x[:, signed:].std(0)
+        free[signed + int(torch.where(negative, effect, 0.0).argmin())] = False
     ratio, order = (size / torch.exp(x @ weights)).sort()
     below = counts[order].cumsum(0)
     widths = ratio[torch.searchsorted(below, torch.tensor(SHARES, dtype=torch.float64)).clamp_max(len(ratio) - 1)]

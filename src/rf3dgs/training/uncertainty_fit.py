@@ -26,7 +26,8 @@ from rf3dgs.training.radio import check_spectra
 
 LEAST_POSITIONS = 8
 RANDOM_FOLDS, STRIPS = 4, 3
-SHRINK = 200.0  # [pixel]; as if a cell's segment, and a segment's surface, had been seen in so many
+SHRINK = 200.0  # [pixel]; a cell is drawn to its segment, and that to all, as if that had been seen in so many
+RAY_SHRINK = 20.0  # the same of a plane's ways
 FARTHEST_DB = 30.0
 LEAST_SEEN = 0.5  # [pixel]; a position saw a cell that decides as much of its picture
 MOST = 300_000
@@ -65,7 +66,9 @@ def fit_uncertainty(field: RadioField, spectra: Spectrum, *, progress: Progress 
     progress.start("uncertainty", len(folds))
     views = lit_views(spectra, _rays(field, spectra))
     shape = (surface.means, surface.quats, surface.log_scales, surface.logit_opacities)
-    observed = observe(Gaussians(*shape, torch.zeros(len(surface), 1, 1)), views, unit=surface.unit)
+    observed = observe(
+        Gaussians(*shape, torch.zeros(len(surface), 1, 1)), views, unit=surface.unit, backend=field.backend
+    )
     observed = replace(observed, level_db=observed.level_db.clamp_min(floor_db(surface)))
     tables = _Tables.empty(len(views), len(surface.cell_sh), _planes(field) + 1)
     missed = []
@@ -114,13 +117,13 @@ def _doubt(surface: LitSurface, tables: _Tables, spectra: Spectrum, places: list
     typical = everywhere[1] / everywhere[0].clamp_min(1e-9)
     segment_of = torch.zeros(len(cells), dtype=torch.long).index_put((surface.cell_of,), surface.segment_of)
     segments = torch.zeros(len(surface.laws), 2).index_add_(0, segment_of, cells)
-    segment = _drawn(segments, typical)
+    segment = _drawn(segments, typical, SHRINK)
     planes = tables.planes[places].sum(0)
     receivers = spectra.pose.position[places]
     apart = torch.cdist(receivers, receivers) + torch.diag(torch.full((len(receivers),), torch.inf))
     return Uncertainty(
-        spread_db=_drawn(cells, segment[segment_of]).sqrt(),
-        source_db=_drawn(planes, planes[:, 1].sum() / planes[:, 0].sum().clamp_min(1e-9)).sqrt(),
+        spread_db=_drawn(cells, segment[segment_of], SHRINK).sqrt(),
+        source_db=_drawn(planes, planes[:, 1].sum() / planes[:, 0].sum().clamp_min(1e-9), RAY_SHRINK).sqrt(),
         receivers=receivers,
         seen=seen[:, places],
         spacing=max(float(apart.amin(-1).median()), 1e-3),
@@ -129,9 +132,9 @@ def _doubt(surface: LitSurface, tables: _Tables, spectra: Spectrum, places: list
     )
 
 
-def _drawn(sums: Tensor, to: Tensor) -> Tensor:
-    """Means `[n]` of `sums` `[n, 2]`, drawn to `to` as if that had been seen in `SHRINK` pixels."""
-    return (sums[:, 1] + SHRINK * to) / (sums[:, 0] + SHRINK)
+def _drawn(sums: Tensor, to: Tensor, shrink: float) -> Tensor:
+    """Means `[n]` of `sums` `[n, 2]`, drawn to `to` as if that had been seen in `shrink` pixels."""
+    return (sums[:, 1] + shrink * to) / (sums[:, 0] + shrink)
 
 
 def _rays(field: RadioField, spectra: Spectrum) -> list[Rays] | None:
@@ -216,7 +219,7 @@ def _errors(
 
 
 def _rows(one: LeftOut, tables: _Tables, spectra: Spectrum, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Numbers `[n, 9]`, errors and counts `[n]` of pixels at positions that were left out, by what the others tell."""
+    """Numbers `[n, 10]`, errors and counts `[n]` of pixels at positions that were left out, by what the others tell."""
     surface = one.field.surface
     assert isinstance(surface, LitSurface)
     others = [place for place in range(len(spectra)) if place not in one.places]
