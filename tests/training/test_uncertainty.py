@@ -1,5 +1,6 @@
 """Laws of a mirror field's uncertainty, in a room with one wall that no model can know."""
 
+import json
 import math
 from dataclasses import replace
 
@@ -10,7 +11,7 @@ from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid, pinhole_grid
 from rf3dgs.core.units import friis_gain
-from rf3dgs.field.io import load_field
+from rf3dgs.field.io import _digest, load_field
 from rf3dgs.field.uncertainty import NUMBERS, SHARES, Uncertainty, numbers_of
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.surface import sample_mesh
@@ -133,6 +134,10 @@ def test_uncertainty_comes_back_from_disk_and_older_fields_refuse(field, trainin
     assert float((before / after).log().abs().median()) < 0.01
     assert torch.equal(loaded.doubt.seen, field.doubt.seen)
     replace(field, doubt=None).save(tmp_path / "unsure.field")
+    path = tmp_path / "unsure.field" / "field.json"
+    body = json.loads(path.read_text())["body"]
+    assert body.pop("uncertainty") is None
+    path.write_text(json.dumps({"body": body, "sha256": _digest(body)}))
     with pytest.raises(InputError, match="does not know its uncertainty; fit_uncertainty"):
         load_field(tmp_path / "unsure.field").uncertainty(pose, GRID)
 
