@@ -22,7 +22,6 @@ from rf3dgs.training.line_of_sight import fit_line_of_sight
 from rf3dgs.training.lit_fit import Scattering, fit_laws, refine_residual
 from rf3dgs.training.lit_views import LitView, Observations, lit_views, observe
 from rf3dgs.training.mirror import PASSES
-from rf3dgs.training.other_sources import as_known, with_sources
 from rf3dgs.training.radio import check_spectra
 
 LEAST_POSITIONS = 8
@@ -67,20 +66,19 @@ def fit_uncertainty(field: RadioField, spectra: Spectrum, *, progress: Progress 
     progress.start("uncertainty", len(folds))
     views = lit_views(spectra, _rays(field, spectra))
     shape = (surface.means, surface.quats, surface.log_scales, surface.logit_opacities)
-    geometry = Gaussians(*shape, torch.zeros(len(surface), 1, 1))
-    observed = observe(geometry, views, unit=surface.unit, backend=field.backend)
+    observed = observe(
+        Gaussians(*shape, torch.zeros(len(surface), 1, 1)), views, unit=surface.unit, backend=field.backend
+    )
     observed = replace(observed, level_db=observed.level_db.clamp_min(floor_db(surface)))
     tables = _Tables.empty(len(views), len(surface.cell_sh), _planes(field) + 1)
     missed = []
     for number, places in enumerate(folds):
-        basis, bake = (field, views, observed), number < RANDOM_FOLDS
-        if not bake and field.sources is not None:
-            basis = with_sources(*basis, geometry, spectra, places)
-        missed.append(_left_out(*basis, spectra, places, tables, bake=bake))
+        left_out = _left_out(field, views, observed, spectra, places, tables, bake=number < RANDOM_FOLDS)
+        missed.append(left_out)
         progress.update(number + 1)
     seen = torch.zeros(len(surface.cell_sh), len(views))
     seen.index_put_((surface.cell_of[observed.gaussian], observed.view), observed.weight, accumulate=True)
-    rows = [_rows(one, field, tables, spectra, seen > LEAST_SEEN) for one in missed]
+    rows = [_rows(one, tables, spectra, seen > LEAST_SEEN) for one in missed]
     numbers, error, counts = (torch.cat(part) for part in zip(*rows, strict=True))
     weights, widths = calibrate(numbers, error, counts)
     everyone = list(range(len(views)))
@@ -220,16 +218,12 @@ def _errors(
     return error, counts
 
 
-def _rows(
-    one: LeftOut, field: RadioField, tables: _Tables, spectra: Spectrum, seen: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def _rows(one: LeftOut, tables: _Tables, spectra: Spectrum, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Numbers `[n, 10]`, errors and counts `[n]` of pixels at positions that were left out, by what the others tell."""
     surface = one.field.surface
     assert isinstance(surface, LitSurface)
     others = [place for place in range(len(spectra)) if place not in one.places]
     doubt = _doubt(surface, tables, spectra, others, seen)
-    if field.sources is not None and one.field.sources is not None and one.field.sources is not field.sources:
-        doubt = replace(doubt, source_db=as_known(doubt.source_db, field.sources, one.field.sources))
     numbers = [numbers_of(one.field, doubt, spectra.pose[place], spectra.grid).flatten(0, 1) for place in one.places]
     every = max(1, len(spectra) * 2 * spectra.grid.solid_angle.numel() // MOST)
     chosen = torch.arange(0, one.error_db.numel(), every)
