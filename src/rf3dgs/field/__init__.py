@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from rf3dgs.field.sources import PointSources as PointSources
     from rf3dgs.field.sources import Rays as Rays
     from rf3dgs.field.transmitter import estimate_transmitter as estimate_transmitter
+    from rf3dgs.field.uncertainty import Uncertainty as Uncertainty
 
 _HOMES = {
     "RadioField": ".radio_field",
@@ -18,7 +19,8 @@ _HOMES = {
     "LitSurface": ".lit",
     "PointSources": ".sources",
     "Rays": ".sources",
+    "Uncertainty": ".uncertainty",
     "estimate_transmitter": ".transmitter",
 }
-__all__ = ["RadioField", "Surface", "LitSurface", "PointSources", "Rays", "estimate_transmitter"]  # noqa: RUF022 (reading order)
+__all__ = ["RadioField", "Surface", "LitSurface", "PointSources", "Rays", "Uncertainty", "estimate_transmitter"]  # noqa: RUF022 (reading order)
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

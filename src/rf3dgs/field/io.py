@@ -26,6 +26,7 @@ from rf3dgs.data.safe import read_bytes, read_json
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.field.source_files import source_record, source_tensors, sources_of
 from rf3dgs.field.surface_files import surface_kinds, surface_of, surface_record, surface_tensors
+from rf3dgs.field.uncertainty_files import doubt_kinds, doubt_of, doubt_record, doubt_tensors
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Instrument
 
@@ -40,6 +41,7 @@ CONVENTIONS = {
     "quaternions": "wxyz, world_from_device",
     "gain": "window value 0.5 + SH(direction from receiver to Gaussian), 3DGS order and signs",
     "residual": "mirror model: E in dB, the same harmonics; laws R, b, alpha, A, e per segment",
+    "uncertainty": "log std [dB] = weights . numbers; widths of shares in std",
     "csi": "vector: delay residual [ns], departure residual x, y, z; paper: azimuth, zenith, delay as 0.5 + SH",
 }
 
@@ -100,7 +102,7 @@ def _tensors(field: RadioField) -> dict[str, Tensor]:
     stored["colour"] = field.colour.to(torch.uint8).contiguous()
     if field.plane_of is not None:
         stored["plane_of"] = field.plane_of.to(torch.int16).contiguous()
-    return stored | source_tensors(field.sources)
+    return stored | source_tensors(field.sources) | doubt_tensors(field.doubt)
 
 
 def _description(field: RadioField) -> dict[str, Any]:
@@ -119,6 +121,7 @@ def _description(field: RadioField) -> dict[str, Any]:
         "bounds": field.bounds.tolist(),
         "sources": source_record(field.sources),
         "labelled": field.plane_of is not None,
+        "uncertainty": doubt_record(field.doubt),
         "versions": {"torch": torch.__version__, "python": sys.version.split()[0]},
         "meta": field.meta,
     }
@@ -127,7 +130,11 @@ def _description(field: RadioField) -> dict[str, Any]:
 def _check(tensors: Mapping[str, Tensor], body: Mapping[str, Any], source: Path) -> None:
     """Refuse tensors that are missing, have another shape or type than the description says, or are not finite."""
     count = int(body["gaussians"])
-    expected = surface_kinds(body) | {"solidity": ((count,), torch.uint8), "colour": ((count, 3), torch.uint8)}
+    expected = (
+        surface_kinds(body)
+        | doubt_kinds(body)
+        | {"solidity": ((count,), torch.uint8), "colour": ((count, 3), torch.uint8)}
+    )
     if body.get("labelled", False):
         expected["plane_of"] = ((count,), torch.int16)
     for name, (shape, kind) in expected.items():
@@ -166,6 +173,7 @@ def _assemble(tensors: Mapping[str, Tensor], body: Mapping[str, Any]) -> RadioFi
         colour=tensors["colour"],
         meta=dict(body["meta"]),
         plane_of=tensors["plane_of"].long() if body.get("labelled", False) else None,
+        doubt=doubt_of(tensors, body.get("uncertainty")),
     )
 
 

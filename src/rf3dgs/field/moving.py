@@ -49,7 +49,7 @@ def moved(field: "RadioField", tx: Pose, *, order: int = 2) -> "RadioField":
         sources = moved_sources(sources, field.obstacles, field.bounds, tx.position, order=order)
     trained = " ".join(f"{value:.3f}" for value in field.tx.position.tolist())
     meta = {"trained with the transmitter at": trained} | field.meta
-    return replace(field, surface=lit, sources=sources, tx=tx, meta=meta)
+    return replace(field, surface=lit, sources=sources, tx=tx, meta=meta, doubt=None)
 
 
 def moved_surface(surface: LitSurface, obstacles: Obstacles, tx: Tensor) -> LitSurface:

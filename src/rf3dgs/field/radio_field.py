@@ -18,10 +18,11 @@ from rf3dgs.channel.paths import Paths
 from rf3dgs.core.angles import angles_of
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import DirectionGrid, equirect_grid, sample_grid, view_of
+from rf3dgs.core.grids import DirectionGrid, equirect_grid, list_grid, sample_grid, view_of
 from rf3dgs.field.lit import LitSurface
 from rf3dgs.field.radiance import Radiance, Surface
 from rf3dgs.field.sources import PointSources, Rays
+from rf3dgs.field.uncertainty import Uncertainty, numbers_of
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
@@ -42,6 +43,7 @@ class RadioField:
     frequency [Hz]; instrument: what its training spectra were taken with, and so what it renders.
     tx: the transmitter's pose, given or estimated. bounds `[2, 3]`: low and high corner of the training positions [m].
     colour `[N, 3]` uint8: how a viewer paints the Gaussians. meta: free text about the run (seed, versions, steps).
+    doubt: what is known of its errors (`training.fit_uncertainty`), or None.
     """
 
     surface: Surface | LitSurface
@@ -55,6 +57,7 @@ class RadioField:
     meta: dict[str, str | int | float | bool] = field(default_factory=dict)
     backend: Backend = "auto"
     plane_of: Tensor | None = None
+    doubt: Uncertainty | None = None
 
     @property
     def window(self) -> DbWindow:
@@ -135,6 +138,39 @@ class RadioField:
             order=table[..., 8].long(),
             kind=table[..., 9].long(),
         )
+
+    def uncertainty(self, pose: Pose, grid: DirectionGrid, *, share: float | None = None) -> Tensor:
+        """How far `gain_db` may be off `[*batch, row, col]` [dB] at one pose or a batch: half the interval about it
+        that holds 68.3 % of the errors where nobody measured, or `share` of them.
+
+        Raises InputError for a field that was not asked to learn it.
+        """
+        doubt = self._known_doubt()
+        width = doubt.width(share)
+        flat = pose.flat()
+        if len(flat) == 0:
+            raise InputError("uncertainty needs at least one pose; got an empty batch")
+        rows = [width * doubt.std_db(numbers_of(self, doubt, flat[index], grid)) for index in range(len(flat))]
+        return torch.stack(rows).reshape(*pose.batch_shape, *grid.shape)
+
+    def uncertainty_of(self, paths: Paths, *, share: float | None = None) -> Tensor:
+        """How far the levels of this field's `paths` `[*batch, path]` may be off [dB]: `uncertainty` in the direction
+        of each; 0 where a path is not valid."""
+        doubt, flat = self._known_doubt(), paths.rx.flat()
+        aoa = paths.aoa.reshape(len(flat), -1, 3)
+        rows = [
+            self.uncertainty(flat[index], list_grid(flat[index].to_device(aoa[index]))) for index in range(len(flat))
+        ]
+        width = doubt.width(share)
+        return width * torch.cat(rows).reshape(paths.valid.shape) * paths.valid
+
+    def _known_doubt(self) -> Uncertainty:
+        if self.doubt is None:
+            raise InputError(
+                "this field does not know its uncertainty; fit_uncertainty(field, spectra) learns it, for the mirror "
+                "model"
+            )
+        return self.doubt
 
     def without_sources(self) -> "RadioField":
         """The surface alone."""

@@ -259,6 +259,12 @@ class PointSources:
         places, parts = zip(*found, strict=True)
         return torch.cat(places), Rays(*(torch.cat([getattr(part, name) for part in parts]) for name in RAY_FIELDS))
 
+    def candidates(self, receiver: Tensor, obstacles: Obstacles) -> tuple[Rays, Tensor]:
+        """All ways over surface to a receiver `[3]` [m], open or not, and the share `[k]` that each lets pass."""
+        (part,) = _positions(receiver[None])
+        ways = ways_over(self.plan, part)
+        return self._rays_of(ways), _tensor(self.transmittance(ways, part, obstacles))
+
     def _rays_of(self, ways: Ways) -> Rays:
         values = (self.gain(ways), ways.arrival, ways.departure, ways.distance / SPEED_OF_LIGHT)
         power, arrival, departure, delay = (_tensor(value) for value in values)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rf3dgs.training.photographs import render_photo as render_photo
     from rf3dgs.training.radio import fit_radio as fit_radio
     from rf3dgs.training.refine import refine_field as refine_field
+    from rf3dgs.training.uncertainty_fit import fit_uncertainty as fit_uncertainty
     from rf3dgs.training.visual import fit_geometry as fit_geometry
 
 __all__ = [  # noqa: RUF022 (reading order)
@@ -23,6 +24,7 @@ __all__ = [  # noqa: RUF022 (reading order)
     "RadioConfig",
     "fit_radio",
     "refine_field",
+    "fit_uncertainty",
     "train",
     "TrainingStopped",
     "State",
@@ -38,6 +40,7 @@ __getattr__, __dir__ = lazy_names(
         "RadioConfig": ".config",
         "fit_radio": ".radio",
         "refine_field": ".refine",
+        "fit_uncertainty": ".uncertainty_fit",
         "train": ".loop",
         "TrainingStopped": ".loop",
         "State": ".checkpoint",

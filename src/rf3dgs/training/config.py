@@ -17,6 +17,9 @@ class RadioConfig:
     model: Literal["mirror", "paper"] = "paper"
     """"mirror": the transmitter's mirror images as point sources, and surfaces that scatter by laws of their own;
     "paper": harmonics in a dB window on every Gaussian, the line of sight as a point source."""
+    uncertainty: bool = False
+    """The mirror model alone: learn how far its levels may be off, by leaving training positions out in turn. It takes
+    about three times as long as the rest."""
     steps: int = 1000
     """Iterations; each takes the picture of one training position, a whole sphere or a pinhole's."""
     csi_every: int = 2

@@ -55,6 +55,8 @@ def fit_radio(
     progress = Silent() if progress is None else progress
     if config.steps < 0:
         raise InputError(f"steps must be 0 (the closed-form start alone) or more; got {config.steps}")
+    if config.uncertainty and config.model != "mirror":
+        raise InputError('uncertainty belongs to the mirror model; choose model="mirror" or leave it out')
     geometry.check()
     check_spectra(spectra)
     given, geometry = len(geometry), _detail(geometry, spectra, config)
@@ -70,7 +72,8 @@ def fit_radio(
         "Gaussians given": given,
     }
     if config.model == "mirror":
-        return fit_mirror(geometry, spectra, config, where, window, _colour(geometry), meta, progress)
+        field = fit_mirror(geometry, spectra, config, where, window, _colour(geometry), meta, progress)
+        return _with_uncertainty(field, spectra, progress) if config.uncertainty else field
     found = None
     if config.line_of_sight == "source":
         with_mirrors = config.mirror_order > 0
@@ -150,6 +153,12 @@ def check_spectra(spectra: Spectrum, numbers: Tensor | None = None) -> None:
             first = int(wrong.nonzero()[0])
             number = first if numbers is None else int(numbers[first])
             raise InputError(f"the spectrum of position {number} {text}; remove or repair it")
+
+
+def _with_uncertainty(field: RadioField, spectra: Spectrum, progress: Progress) -> RadioField:
+    from rf3dgs.training.uncertainty_fit import fit_uncertainty  # which asks this module to check spectra
+
+    return fit_uncertainty(field, spectra, progress=progress)
 
 
 def _detail(geometry: Gaussians, spectra: Spectrum, config: RadioConfig) -> Gaussians:
