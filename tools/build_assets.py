@@ -19,7 +19,7 @@ from rf3dgs.core.grids import equirect_grid
 from rf3dgs.core.progress import Progress
 from rf3dgs.data.dataset import Dataset
 from rf3dgs.propagation.config import PhotoConfig, TraceConfig
-from rf3dgs.propagation.lobby import lobby
+from rf3dgs.propagation.sites.lobby import lobby
 from rf3dgs.training.radio import fit_radio
 from rf3dgs.training.visual import fit_geometry
 

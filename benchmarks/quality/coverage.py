@@ -10,8 +10,8 @@ import argparse
 
 from rf3dgs.cli.facts import open_scene
 from rf3dgs.propagation.config import PhotoConfig
-from rf3dgs.propagation.coverage import coverage
-from rf3dgs.propagation.walks import camera_tour
+from rf3dgs.propagation.sites.coverage import coverage
+from rf3dgs.propagation.sites.walks import camera_tour
 
 PARTS = {
     "floor": ("floor",),

@@ -27,8 +27,8 @@ from rf3dgs.core.grids import DirectionGrid, pinhole_grid
 from rf3dgs.core.units import db_from_power
 from rf3dgs.evaluation.figures import STYLE
 from rf3dgs.evaluation.pictures import LEVEL_COLOURS, colour_range, coloured
-from rf3dgs.propagation.lobby import lobby
 from rf3dgs.propagation.sionna import trace_each
+from rf3dgs.propagation.sites.lobby import lobby
 from rf3dgs.spectra.beamformers import hann_taper
 from rf3dgs.spectra.codec import DbWindow, PerViewLinear, paper_scale
 from rf3dgs.spectra.config import ArrayProcessing, Method

@@ -22,8 +22,8 @@ from rf3dgs.cli.chain import geometry_of_mesh
 from rf3dgs.cli.facts import open_field
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid, view_of
-from rf3dgs.propagation.lobby import lobby
-from rf3dgs.propagation.scene import Scene
+from rf3dgs.propagation.sites.lobby import lobby
+from rf3dgs.propagation.sites.scene import Scene
 from rf3dgs.splats.compositing import Compositing
 from rf3dgs.splats.raster import Raster
 from rf3dgs.splats.rasterize import rasterize

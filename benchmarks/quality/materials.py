@@ -18,7 +18,7 @@ import numpy as np
 from rf3dgs.core.files import write_whole
 from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.evaluation.figures import STYLE
-from rf3dgs.propagation.materials import SURFACES, scattering_amplitude, smooth_height
+from rf3dgs.propagation.sites.materials import SURFACES, scattering_amplitude, smooth_height
 
 FREQUENCIES = {
     "2.4 GHz": 2.4e9,

@@ -31,8 +31,8 @@ from rf3dgs.core.grids import DirectionGrid, equirect_grid, pinhole_grid
 from rf3dgs.core.progress import Console
 from rf3dgs.evaluation import metrics
 from rf3dgs.propagation.config import TraceConfig
-from rf3dgs.propagation.presets import preset_of
 from rf3dgs.propagation.sionna import trace_each
+from rf3dgs.propagation.sites.presets import preset_of
 from rf3dgs.spectra.codec import window_of
 from rf3dgs.spectra.covariance import covariance_of
 from rf3dgs.spectra.scan import array_instrument, beamform, spectrum_of

@@ -20,8 +20,8 @@ from rf3dgs.cli.facts import open_scene
 from rf3dgs.propagation.config import PhotoConfig
 from rf3dgs.propagation.llvm import mitsuba_variant, prepare
 from rf3dgs.propagation.photographer import linear_light
-from rf3dgs.propagation.scene_files import srgb_from_linear, write_visual_scene
-from rf3dgs.propagation.walks import camera_tour
+from rf3dgs.propagation.sites.scene_files import srgb_from_linear, write_visual_scene
+from rf3dgs.propagation.sites.walks import camera_tour
 
 
 def main() -> None:

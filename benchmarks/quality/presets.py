@@ -15,9 +15,9 @@ import torch
 
 from rf3dgs.core.units import db_from_power
 from rf3dgs.propagation.config import TraceConfig
-from rf3dgs.propagation.lobby import lobby
-from rf3dgs.propagation.presets import PRESETS
 from rf3dgs.propagation.sionna import Tracer
+from rf3dgs.propagation.sites.lobby import lobby
+from rf3dgs.propagation.sites.presets import PRESETS
 
 KINDS = {"exact": (0, 1), "diffuse": (2, 3), "refracted": (4, 5, 6, 7), "diffracted": tuple(range(8, 16))}
 

@@ -120,9 +120,9 @@ def let_through(sounding: Sounding, place: Tensor, sources: Tensor, power: Tenso
 
 def lobby_positions(count: int, seed: int = SEED, preset: str = "diffuse") -> Iterator[Paths]:
     """Traced paths `[path]` of random positions of the lobby under a preset, looking at the transmitter."""
-    from rf3dgs.propagation.lobby import lobby
-    from rf3dgs.propagation.presets import preset_of
     from rf3dgs.propagation.sionna import trace_each
+    from rf3dgs.propagation.sites.lobby import lobby
+    from rf3dgs.propagation.sites.presets import preset_of
 
     site, config = preset_of(preset).applied(lobby(), TraceConfig(rays=50_000))
     rx = Pose.look_at(site.receivers(count, seed=seed).position, site.tx.position)

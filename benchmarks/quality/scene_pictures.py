@@ -21,13 +21,13 @@ from rf3dgs.core.files import write_whole
 from rf3dgs.core.frames import Pose, matrix_from_quaternion, mitsuba_from_viewmat
 from rf3dgs.core.grids import Camera, equirect_grid, pinhole_grid
 from rf3dgs.evaluation.pictures import colour_range, spectrum_picture
-from rf3dgs.propagation import shapes
 from rf3dgs.propagation.config import PhotoConfig, TraceConfig
 from rf3dgs.propagation.llvm import mitsuba_variant, prepare
-from rf3dgs.propagation.lobby import lobby
 from rf3dgs.propagation.photographer import render_panorama, render_photos
-from rf3dgs.propagation.presets import preset_of
 from rf3dgs.propagation.sionna import trace
+from rf3dgs.propagation.sites import shapes
+from rf3dgs.propagation.sites.lobby import lobby
+from rf3dgs.propagation.sites.presets import preset_of
 from rf3dgs.spectra.scan import spectrum_of
 
 COLOURS = 200

@@ -29,8 +29,8 @@ from rf3dgs.core.files import write_whole
 from rf3dgs.geometry import Surfaces, find_surfaces
 from rf3dgs.geometry.flatten import flatten
 from rf3dgs.geometry.patches import CELL
-from rf3dgs.propagation.lobby import lobby
-from rf3dgs.propagation.scene import Scene
+from rf3dgs.propagation.sites.lobby import lobby
+from rf3dgs.propagation.sites.scene import Scene
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.image_loss import psnr
 from rf3dgs.splats.ply import read_ply

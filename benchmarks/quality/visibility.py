@@ -21,8 +21,8 @@ from torch import Tensor
 
 from rf3dgs.cli.chain import geometry_of_mesh
 from rf3dgs.cli.facts import open_field
-from rf3dgs.propagation.lobby import lobby
-from rf3dgs.propagation.scene import Scene
+from rf3dgs.propagation.sites.lobby import lobby
+from rf3dgs.propagation.sites.scene import Scene
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.splats.surface import normals
 

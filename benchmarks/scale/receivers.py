@@ -15,9 +15,9 @@ import time
 from pathlib import Path
 
 from rf3dgs.propagation.config import TraceConfig
-from rf3dgs.propagation.jobs import run_job
-from rf3dgs.propagation.scenes import scene_of
-from rf3dgs.propagation.trace_job import SHARD_SIZE, TraceJob
+from rf3dgs.propagation.jobs.job import run_job
+from rf3dgs.propagation.jobs.trace_job import SHARD_SIZE, TraceJob
+from rf3dgs.propagation.sites.scenes import scene_of
 
 PAGE = os.sysconf("SC_PAGE_SIZE") / 1e6
 

@@ -9,8 +9,8 @@ from benchmarks.quality.radiance.data import geometry_of
 from benchmarks.quality.radiance.scenes import MOVED, SITES, Setting, under_a_roof
 
 from rf3dgs.core.errors import InputError
-from rf3dgs.propagation.lobby import lobby
-from rf3dgs.propagation.shapes import box
+from rf3dgs.propagation.sites.lobby import lobby
+from rf3dgs.propagation.sites.shapes import box
 
 
 def test_only_points_below_a_face_are_under_a_roof():

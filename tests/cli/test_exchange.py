@@ -11,7 +11,7 @@ from scipy.io import loadmat
 from rf3dgs.channel.io import PathsReader, load_paths, save_paths
 from rf3dgs.cli.main import main
 from rf3dgs.core.frames import Pose
-from rf3dgs.propagation.deepmimo import read_deepmimo
+from rf3dgs.propagation.exchange.deepmimo import read_deepmimo
 from rf3dgs.propagation.room import shoebox
 
 SIZE, TX, FREQUENCY = (8.0, 6.0, 3.0), Pose((1.0, 1.5, 2.3)), 28e9
@@ -160,7 +160,7 @@ def test_a_measurement_becomes_paths_through_sage(tmp_path, suffix):
     from rf3dgs.channel.arrays import planar_array
     from rf3dgs.channel.response import cfr
     from rf3dgs.channel.sounding import Sounding
-    from rf3dgs.propagation.measured import write_sounding
+    from rf3dgs.propagation.exchange.measured import write_sounding
 
     array = planar_array(3, 3, "isotropic")
     rx = Pose.look_at(RX.position[:1], TX.position)
@@ -181,7 +181,7 @@ def test_a_row_of_elements_is_refused_until_what_it_cannot_tell_is_taken_as_ahea
     from rf3dgs.channel.arrays import planar_array
     from rf3dgs.channel.response import cfr
     from rf3dgs.channel.sounding import Sounding
-    from rf3dgs.propagation.measured import write_sounding
+    from rf3dgs.propagation.exchange.measured import write_sounding
 
     row = planar_array(1, 6, "isotropic")
     rx = Pose.look_at([[4.0, 3.2, TX.position[2]]], TX.position)

@@ -11,11 +11,11 @@ from rf3dgs.channel.io import PathsReader
 from rf3dgs.cli.main import main
 from rf3dgs.data.formats.detect import read_photos
 from rf3dgs.propagation.config import PhotoConfig, ReceiverConfig
-from rf3dgs.propagation.lobby import lobby
+from rf3dgs.propagation.jobs.toolchain import fingerprint
 from rf3dgs.propagation.photographer import render_panoramas
-from rf3dgs.propagation.receivers import receivers_of
-from rf3dgs.propagation.scenes import scene_of
-from rf3dgs.propagation.toolchain import fingerprint
+from rf3dgs.propagation.sites.lobby import lobby
+from rf3dgs.propagation.sites.receivers import receivers_of
+from rf3dgs.propagation.sites.scenes import scene_of
 
 TRACE = ("--trace.rays", "2000", "--trace.depth", "1")
 PHOTO = ("--photo.width", "24", "--photo.height", "16", "--photo.samples", "1")

@@ -225,7 +225,7 @@ def test_the_command_line_fits_geometry_to_pictures_without_poses(pictures, tmp_
 @pytest.mark.parametrize("lens", ["pinhole", "radial"])
 def test_a_walk_through_the_lobby_is_found_within_two_centimetres(tmp_path, lens):
     pytest.importorskip("pycolmap")
-    from rf3dgs.propagation.lobby import lobby
+    from rf3dgs.propagation.sites.lobby import lobby
 
     vertices, faces, colours = lobby().mesh(0.1)
     painted = sample_mesh(vertices, faces, count=150_000, seed=0, colours=colours)

@@ -10,10 +10,10 @@ from rf3dgs.channel.arrays import ofdm, planar_array
 from rf3dgs.channel.paths import Paths
 from rf3dgs.channel.response import cfr
 from rf3dgs.core.frames import Pose
-from rf3dgs.propagation import shapes
 from rf3dgs.propagation.llvm import find_llvm, mitsuba_variant
-from rf3dgs.propagation.scene import Scene, SceneObject
-from rf3dgs.propagation.scene_files import write_radio_scene
+from rf3dgs.propagation.sites import shapes
+from rf3dgs.propagation.sites.scene import Scene, SceneObject
+from rf3dgs.propagation.sites.scene_files import write_radio_scene
 
 pytestmark = pytest.mark.oracle
 

@@ -10,11 +10,11 @@ from rf3dgs.channel.paths import Paths
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.units import SPEED_OF_LIGHT, db_from_power, friis_gain
-from rf3dgs.propagation import shapes
 from rf3dgs.propagation.config import TraceConfig
 from rf3dgs.propagation.llvm import find_llvm
 from rf3dgs.propagation.room import shoebox
-from rf3dgs.propagation.scene import Scene, SceneObject
+from rf3dgs.propagation.sites import shapes
+from rf3dgs.propagation.sites.scene import Scene, SceneObject
 
 pytestmark = pytest.mark.oracle
 

@@ -18,12 +18,12 @@ import torch
 
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.units import friis_gain, wavelength
-from rf3dgs.propagation import shapes
 from rf3dgs.propagation.config import TraceConfig
 from rf3dgs.propagation.llvm import find_llvm
-from rf3dgs.propagation.materials import permittivity
 from rf3dgs.propagation.room import THICKNESS, Slab, slab_reflection
-from rf3dgs.propagation.scene import Scene, SceneObject
+from rf3dgs.propagation.sites import shapes
+from rf3dgs.propagation.sites.materials import permittivity
+from rf3dgs.propagation.sites.scene import Scene, SceneObject
 
 pytestmark = pytest.mark.oracle
 

@@ -4,7 +4,7 @@ import pytest
 
 from rf3dgs.propagation import sionna
 from rf3dgs.propagation.llvm import find_llvm
-from rf3dgs.propagation.lobby import lobby
+from rf3dgs.propagation.sites.lobby import lobby
 
 
 @pytest.fixture(scope="session")

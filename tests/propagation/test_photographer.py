@@ -7,10 +7,10 @@ import torch
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, equirect_grid, pinhole_grid
-from rf3dgs.propagation import shapes
 from rf3dgs.propagation.config import PhotoConfig
 from rf3dgs.propagation.photographer import camera_tour, render_panorama, render_panoramas, render_photos
-from rf3dgs.propagation.scene import SceneObject
+from rf3dgs.propagation.sites import shapes
+from rf3dgs.propagation.sites.scene import SceneObject
 
 QUICK = PhotoConfig(width=80, height=60, samples=8, bounces=3)
 
@@ -117,7 +117,7 @@ def test_the_lobby_is_well_exposed_and_the_same_on_every_run(site, tracer):
 
 
 def test_a_room_without_lights_gets_a_lamp(tracer):
-    from rf3dgs.propagation.scenes import scene_of
+    from rf3dgs.propagation.sites.scenes import scene_of
 
     box = scene_of("box")
     (photo,) = render_photos(box, camera_tour(box, 1, seed=0, config=QUICK), QUICK)
@@ -178,7 +178,7 @@ def test_the_tour_sees_each_square_metre_of_floor_ceiling_and_walls_from_several
 
 
 def test_a_tour_goes_round_what_stands_in_the_middle():
-    from rf3dgs.propagation.scenes import scene_of
+    from rf3dgs.propagation.sites.scenes import scene_of
 
     street = scene_of("simple_street_canyon")
     positions = torch.stack([camera.position for camera in camera_tour(street, 12, seed=0)])

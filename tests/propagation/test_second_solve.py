@@ -8,7 +8,7 @@ import torch
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.grids import equirect_grid, pinhole_grid
 from rf3dgs.propagation.config import TraceConfig
-from rf3dgs.propagation.scenes import scene_of
+from rf3dgs.propagation.sites.scenes import scene_of
 from rf3dgs.spectra.peaks import main_peak
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.yaws import at_yaws

@@ -10,9 +10,9 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.units import SPEED_OF_LIGHT, db_from_power, friis_gain
 from rf3dgs.propagation.config import TraceConfig
 from rf3dgs.propagation.llvm import mitsuba_variant
-from rf3dgs.propagation.scene import Scene
-from rf3dgs.propagation.scene_files import check_foreign_xml
-from rf3dgs.propagation.scenes import scene_of
+from rf3dgs.propagation.sites.scene import Scene
+from rf3dgs.propagation.sites.scene_files import check_foreign_xml
+from rf3dgs.propagation.sites.scenes import scene_of
 
 QUICK = TraceConfig(rays=20_000, depth=2, seed=7)
 
@@ -186,7 +186,7 @@ def test_unknown_scenes_are_refused(tracer):
 
 
 def test_an_xml_file_is_read_with_its_meshes(tracer, site, tmp_path):
-    from rf3dgs.propagation.scene_files import write_radio_scene
+    from rf3dgs.propagation.sites.scene_files import write_radio_scene
 
     few = replace(site, objects=tuple(site[name] for name in ("wall-west", "wall-north", "column-3")))
     path = write_radio_scene(few, tmp_path)
@@ -200,7 +200,7 @@ def test_an_xml_file_is_read_with_its_meshes(tracer, site, tmp_path):
 
 
 def test_a_file_named_like_a_built_in_scene_is_its_own_site(tracer, site, tmp_path):
-    from rf3dgs.propagation.scene_files import write_radio_scene
+    from rf3dgs.propagation.sites.scene_files import write_radio_scene
 
     few = replace(site, objects=(site["wall-west"], site["wall-north"]))
     again = scene_of(write_radio_scene(few, tmp_path).rename(tmp_path / "box.xml"))

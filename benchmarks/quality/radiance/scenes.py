@@ -11,14 +11,14 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.progress import Progress
 from rf3dgs.propagation.config import ReceiverConfig, TraceConfig
-from rf3dgs.propagation.jobs import run_job
-from rf3dgs.propagation.lobby import lobby
-from rf3dgs.propagation.presets import preset_of
-from rf3dgs.propagation.receivers import receivers_of
-from rf3dgs.propagation.scene import Scene, SceneObject, without_looks
-from rf3dgs.propagation.scenes import scene_of
-from rf3dgs.propagation.shapes import ball, box, prism
-from rf3dgs.propagation.trace_job import TraceJob
+from rf3dgs.propagation.jobs.job import run_job
+from rf3dgs.propagation.jobs.trace_job import TraceJob
+from rf3dgs.propagation.sites.lobby import lobby
+from rf3dgs.propagation.sites.presets import preset_of
+from rf3dgs.propagation.sites.receivers import receivers_of
+from rf3dgs.propagation.sites.scene import Scene, SceneObject, without_looks
+from rf3dgs.propagation.sites.scenes import scene_of
+from rf3dgs.propagation.sites.shapes import ball, box, prism
 
 MOVED: Mapping[str, tuple[float, float]] = {
     "desk-front": (-5.5, -0.2),

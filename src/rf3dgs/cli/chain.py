@@ -29,8 +29,8 @@ from rf3dgs.training.photographs import render_photo
 
 if TYPE_CHECKING:
     from rf3dgs.field.radio_field import RadioField
-    from rf3dgs.propagation.photo_job import Shot
-    from rf3dgs.propagation.scene import Scene
+    from rf3dgs.propagation.jobs.photo_job import Shot
+    from rf3dgs.propagation.sites.scene import Scene
 
 HOLD_OUT_EVERY = 7
 """Every seventh photograph of a tour is held out: its neighbours on the walk are not."""
@@ -55,7 +55,7 @@ def shots_of_tour(scene: "Scene", count: int, seed: int, config: PhotoConfig) ->
 
     Held-out photographs and the others count their seeds on their own.
     """
-    from rf3dgs.propagation.photo_job import Shot
+    from rf3dgs.propagation.jobs.photo_job import Shot
     from rf3dgs.propagation.photographer import camera_tour
 
     clean = replace(config, samples=config.held_out_samples or config.samples, seed=config.seed + count)
@@ -71,7 +71,7 @@ def shots_of_tour(scene: "Scene", count: int, seed: int, config: PhotoConfig) ->
 
 def photos_of(shots: "Sequence[Shot]", folder: Path) -> list[Photo]:
     """The photographs of these shots, whose files lie in `folder`."""
-    from rf3dgs.propagation.photo_job import photo_name
+    from rf3dgs.propagation.jobs.photo_job import photo_name
 
     photos = []
     for number, shot in enumerate(shots):
@@ -84,7 +84,7 @@ def photograph(
     scene: "Scene", count: int, seed: int, config: PhotoConfig, folder: Path, progress: Progress
 ) -> list[Photo]:
     """Render a tour of the scene into JPEG files in `folder`."""
-    from rf3dgs.propagation.photo_job import photo_name, take
+    from rf3dgs.propagation.jobs.photo_job import photo_name, take
 
     shots = shots_of_tour(scene, count, seed, config)
     for number, content in track(take(scene, shots, lambda: None), "photographs", count, progress):

@@ -72,11 +72,11 @@ class Import:
             reader = stack.enter_context(PathsReader(self.source))
             return iter(reader), len(reader), reader.meta
         if kind == "deepmimo":
-            from rf3dgs.propagation.deepmimo import read_deepmimo
+            from rf3dgs.propagation.exchange.deepmimo import read_deepmimo
 
             paths = read_deepmimo(self.source, self.pair)
         else:
-            from rf3dgs.propagation.measured import read_sounding
+            from rf3dgs.propagation.exchange.measured import read_sounding
             from rf3dgs.spectra.sage import sage
 
             paths = sage(read_sounding(self.source), self.count, untold=self.untold, progress=console()).flat()
@@ -102,8 +102,8 @@ class Export:
         from rf3dgs.channel.binning import stack_paths
         from rf3dgs.channel.io import PathsReader, PathsWriter
         from rf3dgs.core.progress import track
-        from rf3dgs.propagation import matlab
-        from rf3dgs.propagation.deepmimo_write import write_deepmimo
+        from rf3dgs.propagation.exchange import matlab
+        from rf3dgs.propagation.exchange.deepmimo_write import write_deepmimo
 
         if self.strongest is not None and self.strongest < 1:
             raise InputError(f"--strongest must be at least 1; got {self.strongest}")
@@ -160,7 +160,7 @@ def _says_paths(source: Path) -> bool:
 def _lay_reader_beside(path: Path) -> None:
     """Put the MATLAB reader beside an HDF5 file, unless a file of its name is there already."""
     from rf3dgs.core.files import write_whole
-    from rf3dgs.propagation.matlab import READER
+    from rf3dgs.propagation.exchange.matlab import READER
 
     target = path.with_name(READER.name)
     if not target.exists():

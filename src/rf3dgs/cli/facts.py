@@ -9,7 +9,7 @@ from rf3dgs.core.errors import DataError, InputError
 if TYPE_CHECKING:
     from rf3dgs.data.dataset import Dataset
     from rf3dgs.field.radio_field import RadioField
-    from rf3dgs.propagation.scene import Scene
+    from rf3dgs.propagation.sites.scene import Scene
 
 ASSETS = Path(__file__).parent.parent / "assets"
 
@@ -45,13 +45,13 @@ def open_dataset(name: str | Path, *, unseal_test: bool = False) -> "Dataset":
 
 def open_scene(name: str, people: int = 0) -> "Scene":
     """The built-in lobby with so many people, a scene that ships with Sionna RT, or a Sionna/Mitsuba XML file."""
-    from rf3dgs.propagation.scenes import scene_of
+    from rf3dgs.propagation.sites.scenes import scene_of
 
     if people == 0:
         return scene_of(name)
     if name not in ("lobby", "lobby-full"):
         raise InputError(f"--people stand in lobby and lobby-full only; got the scene {name!r}")
-    from rf3dgs.propagation.lobby import lobby
+    from rf3dgs.propagation.sites.lobby import lobby
 
     return lobby("plain" if name == "lobby" else "full", people)
 

@@ -13,7 +13,7 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.propagation.config import PhotoConfig, ReceiverConfig, TraceConfig
 
 if TYPE_CHECKING:
-    from rf3dgs.propagation.jobs import Crew
+    from rf3dgs.propagation.jobs.job import Crew
 
 Preset = Literal["paper", "diffuse", "realistic", "28ghz", "10ghz", "2.4ghz", "transparent"]
 
@@ -47,11 +47,11 @@ class Trace:
         """Trace what the folder lacks, and say how large it is."""
         from rf3dgs.channel.io import PathsReader
         from rf3dgs.cli.facts import open_scene
-        from rf3dgs.propagation.jobs import run_job
-        from rf3dgs.propagation.presets import preset_of
-        from rf3dgs.propagation.receivers import receivers_of
-        from rf3dgs.propagation.scene import without_looks
-        from rf3dgs.propagation.trace_job import TraceJob
+        from rf3dgs.propagation.jobs.job import run_job
+        from rf3dgs.propagation.jobs.trace_job import TraceJob
+        from rf3dgs.propagation.sites.presets import preset_of
+        from rf3dgs.propagation.sites.receivers import receivers_of
+        from rf3dgs.propagation.sites.scene import without_looks
 
         _at_least_one(("--shard-size", self.shard_size), ("--workers", self.workers))
         crew = _crew(self.workers, self.cluster)
@@ -111,9 +111,9 @@ class MakePhotos:
         from rf3dgs.cli.chain import photos_of, shots_of_tour
         from rf3dgs.cli.facts import open_scene
         from rf3dgs.data.formats.nerfstudio import write_nerfstudio
-        from rf3dgs.propagation.jobs import run_job
-        from rf3dgs.propagation.photo_job import PhotoJob
-        from rf3dgs.propagation.presets import preset_of
+        from rf3dgs.propagation.jobs.job import run_job
+        from rf3dgs.propagation.jobs.photo_job import PhotoJob
+        from rf3dgs.propagation.sites.presets import preset_of
 
         _at_least_one(("--count", self.count), ("--shard-size", self.shard_size), ("--workers", self.workers))
         crew = _crew(self.workers, self.cluster)
@@ -164,10 +164,10 @@ class MakePanoramas:
         """Render what the folder lacks, then write the poses."""
         from rf3dgs.cli.facts import open_scene
         from rf3dgs.core.files import write_whole
-        from rf3dgs.propagation.jobs import run_job
-        from rf3dgs.propagation.photo_job import PhotoJob, photo_name, shots_all_round
-        from rf3dgs.propagation.presets import preset_of
-        from rf3dgs.propagation.receivers import receivers_of
+        from rf3dgs.propagation.jobs.job import run_job
+        from rf3dgs.propagation.jobs.photo_job import PhotoJob, photo_name, shots_all_round
+        from rf3dgs.propagation.sites.presets import preset_of
+        from rf3dgs.propagation.sites.receivers import receivers_of
 
         _at_least_one(("--shard-size", self.shard_size), ("--workers", self.workers), ("--samples", self.samples))
         if self.width < 8 or self.width % 2:
@@ -217,7 +217,7 @@ def _crew(workers: int, cluster: str | None) -> "AbstractContextManager[Crew] | 
     """Who does the work: this process (None), processes on this machine, or a dask cluster."""
     if cluster is None and workers == 1:
         return None
-    from rf3dgs.propagation.cluster import existing_cluster, local_processes
+    from rf3dgs.propagation.jobs.cluster import existing_cluster, local_processes
 
     if cluster is None:
         return local_processes(workers)

@@ -9,74 +9,74 @@ from rf3dgs.core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from rf3dgs.propagation import sionna as sionna
-    from rf3dgs.propagation.cluster import existing_cluster as existing_cluster
-    from rf3dgs.propagation.cluster import local_processes as local_processes
     from rf3dgs.propagation.config import PhotoConfig as PhotoConfig
     from rf3dgs.propagation.config import ReceiverConfig as ReceiverConfig
     from rf3dgs.propagation.config import TraceConfig as TraceConfig
-    from rf3dgs.propagation.coverage import Coverage as Coverage
-    from rf3dgs.propagation.deepmimo import deepmimo_pairs as deepmimo_pairs
-    from rf3dgs.propagation.deepmimo import read_deepmimo as read_deepmimo
-    from rf3dgs.propagation.deepmimo_write import write_deepmimo as write_deepmimo
-    from rf3dgs.propagation.jobs import run_job as run_job
+    from rf3dgs.propagation.exchange.deepmimo import deepmimo_pairs as deepmimo_pairs
+    from rf3dgs.propagation.exchange.deepmimo import read_deepmimo as read_deepmimo
+    from rf3dgs.propagation.exchange.deepmimo_write import write_deepmimo as write_deepmimo
+    from rf3dgs.propagation.exchange.matlab import write_mat as write_mat
+    from rf3dgs.propagation.exchange.matlab import write_matlab as write_matlab
+    from rf3dgs.propagation.exchange.measured import read_sounding as read_sounding
+    from rf3dgs.propagation.exchange.measured import write_sounding as write_sounding
+    from rf3dgs.propagation.jobs.cluster import existing_cluster as existing_cluster
+    from rf3dgs.propagation.jobs.cluster import local_processes as local_processes
+    from rf3dgs.propagation.jobs.job import run_job as run_job
+    from rf3dgs.propagation.jobs.photo_job import PhotoJob as PhotoJob
+    from rf3dgs.propagation.jobs.trace_job import TraceJob as TraceJob
     from rf3dgs.propagation.llvm import find_llvm as find_llvm
-    from rf3dgs.propagation.matlab import write_mat as write_mat
-    from rf3dgs.propagation.matlab import write_matlab as write_matlab
-    from rf3dgs.propagation.measured import read_sounding as read_sounding
-    from rf3dgs.propagation.measured import write_sounding as write_sounding
-    from rf3dgs.propagation.photo_job import PhotoJob as PhotoJob
     from rf3dgs.propagation.photographer import render_panorama as render_panorama
     from rf3dgs.propagation.photographer import render_panoramas as render_panoramas
     from rf3dgs.propagation.photographer import render_photos as render_photos
-    from rf3dgs.propagation.presets import Preset as Preset
-    from rf3dgs.propagation.presets import preset_of as preset_of
-    from rf3dgs.propagation.receivers import receivers_of as receivers_of
     from rf3dgs.propagation.room import Slab as Slab
     from rf3dgs.propagation.room import shoebox as shoebox
-    from rf3dgs.propagation.scene import Scene as Scene
-    from rf3dgs.propagation.scene import SceneObject as SceneObject
-    from rf3dgs.propagation.scene_files import write_radio_scene as write_radio_scene
-    from rf3dgs.propagation.scene_files import write_visual_scene as write_visual_scene
-    from rf3dgs.propagation.scenes import scene_of as scene_of
+    from rf3dgs.propagation.sites.coverage import Coverage as Coverage
+    from rf3dgs.propagation.sites.presets import Preset as Preset
+    from rf3dgs.propagation.sites.presets import preset_of as preset_of
+    from rf3dgs.propagation.sites.receivers import receivers_of as receivers_of
+    from rf3dgs.propagation.sites.scene import Scene as Scene
+    from rf3dgs.propagation.sites.scene import SceneObject as SceneObject
+    from rf3dgs.propagation.sites.scene_files import write_radio_scene as write_radio_scene
+    from rf3dgs.propagation.sites.scene_files import write_visual_scene as write_visual_scene
+    from rf3dgs.propagation.sites.scenes import scene_of as scene_of
+    from rf3dgs.propagation.sites.walks import camera_tour as camera_tour
     from rf3dgs.propagation.sounder import Sounder as Sounder
     from rf3dgs.propagation.sounder import sound as sound
-    from rf3dgs.propagation.trace_job import TraceJob as TraceJob
-    from rf3dgs.propagation.walks import camera_tour as camera_tour
 
 _HOMES = {
-    "Scene": ".scene",
-    "SceneObject": ".scene",
-    "scene_of": ".scenes",
-    "Preset": ".presets",
-    "preset_of": ".presets",
+    "Scene": ".sites.scene",
+    "SceneObject": ".sites.scene",
+    "scene_of": ".sites.scenes",
+    "Preset": ".sites.presets",
+    "preset_of": ".sites.presets",
     "ReceiverConfig": ".config",
-    "receivers_of": ".receivers",
-    "write_radio_scene": ".scene_files",
-    "write_visual_scene": ".scene_files",
+    "receivers_of": ".sites.receivers",
+    "write_radio_scene": ".sites.scene_files",
+    "write_visual_scene": ".sites.scene_files",
     "TraceConfig": ".config",
     "sionna": ".sionna",
     "shoebox": ".room",
     "Slab": ".room",
-    "read_deepmimo": ".deepmimo",
-    "deepmimo_pairs": ".deepmimo",
-    "write_deepmimo": ".deepmimo_write",
-    "write_matlab": ".matlab",
-    "write_mat": ".matlab",
+    "read_deepmimo": ".exchange.deepmimo",
+    "deepmimo_pairs": ".exchange.deepmimo",
+    "write_deepmimo": ".exchange.deepmimo_write",
+    "write_matlab": ".exchange.matlab",
+    "write_mat": ".exchange.matlab",
     "PhotoConfig": ".config",
-    "camera_tour": ".walks",
-    "Coverage": ".coverage",
+    "camera_tour": ".sites.walks",
+    "Coverage": ".sites.coverage",
     "render_photos": ".photographer",
     "Sounder": ".sounder",
     "sound": ".sounder",
-    "read_sounding": ".measured",
-    "write_sounding": ".measured",
+    "read_sounding": ".exchange.measured",
+    "write_sounding": ".exchange.measured",
     "render_panorama": ".photographer",
     "render_panoramas": ".photographer",
-    "run_job": ".jobs",
-    "TraceJob": ".trace_job",
-    "PhotoJob": ".photo_job",
-    "local_processes": ".cluster",
-    "existing_cluster": ".cluster",
+    "run_job": ".jobs.job",
+    "TraceJob": ".jobs.trace_job",
+    "PhotoJob": ".jobs.photo_job",
+    "local_processes": ".jobs.cluster",
+    "existing_cluster": ".jobs.cluster",
     "find_llvm": ".llvm",
 }
 __all__ = [  # noqa: RUF022 (reading order)

@@ -17,9 +17,9 @@ from rf3dgs.core.grids import Camera, equirect_grid
 from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.propagation.config import PhotoConfig
 from rf3dgs.propagation.llvm import find_llvm, mitsuba_variant, prepare
-from rf3dgs.propagation.scene import Scene
-from rf3dgs.propagation.scene_files import srgb_from_linear, write_visual_scene
-from rf3dgs.propagation.walks import camera_tour as camera_tour
+from rf3dgs.propagation.sites.scene import Scene
+from rf3dgs.propagation.sites.scene_files import srgb_from_linear, write_visual_scene
+from rf3dgs.propagation.sites.walks import camera_tour as camera_tour
 
 ROULETTE_FROM = 3
 """Light paths of so many segments and more go on by chance, with more weight: as bright in the mean, and cheaper."""

@@ -19,7 +19,7 @@ from rf3dgs.core.angles import angles_of, direction_of
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.units import SPEED_OF_LIGHT, wavelength
-from rf3dgs.propagation.materials import permittivity
+from rf3dgs.propagation.sites.materials import permittivity
 
 WALLS = ("x low", "x high", "y low", "y high", "z low", "z high")
 VACUUM_PERMITTIVITY = 8.8541878128e-12  # [F/m]

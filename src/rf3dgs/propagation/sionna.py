@@ -22,8 +22,8 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.propagation.config import TraceConfig
 from rf3dgs.propagation.llvm import mitsuba_variant, prepare
-from rf3dgs.propagation.scene import Scene
-from rf3dgs.propagation.scene_files import write_radio_scene
+from rf3dgs.propagation.sites.scene import Scene
+from rf3dgs.propagation.sites.scene_files import write_radio_scene
 
 VARIANT = "llvm_ad_mono_polarized"
 
@@ -68,7 +68,7 @@ def trace_each(
     Raises InputError for a receiver outside the scene, inside an object or at the transmitter, and for materials that
     are not defined at the frequency; MissingDependencyError without sionna-rt or LLVM.
     """
-    from rf3dgs.propagation.scenes import scene_of
+    from rf3dgs.propagation.sites.scenes import scene_of
 
     config = TraceConfig() if config is None else config
     progress = Silent() if progress is None else progress

@@ -1,0 +1,1 @@
+"""Paths of other programs and of measurements, in and out."""

@@ -1,0 +1,1 @@
+"""Long work in shards that a killed run keeps, here or on a cluster."""
