@@ -42,11 +42,11 @@ from rf3dgs.evaluation.protocol import Predictor, score
 from rf3dgs.field.lit import LitSurface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.propagation.config import TraceConfig
-from rf3dgs.propagation.jobs import run_job
-from rf3dgs.propagation.lobby import lobby
-from rf3dgs.propagation.presets import preset_of
-from rf3dgs.propagation.scene import without_looks
-from rf3dgs.propagation.trace_job import TraceJob
+from rf3dgs.propagation.jobs.job import run_job
+from rf3dgs.propagation.jobs.trace_job import TraceJob
+from rf3dgs.propagation.sites.lobby import lobby
+from rf3dgs.propagation.sites.presets import preset_of
+from rf3dgs.propagation.sites.scene import without_looks
 from rf3dgs.spectra.codec import DbWindow, window_of
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
