@@ -264,7 +264,8 @@ def _from_mesh(name: str, count: int, seed: int) -> "Gaussians":
 
 def geometry_of_plan(path: Path, count: int, seed: int) -> "Gaussians":
     """Flattened Gaussians on the surfaces of a floor plan."""
-    from rf3dgs.geometry.plan import plan_mesh, read_plan
+    from rf3dgs.geometry.plan import plan_mesh
+    from rf3dgs.geometry.plan_file import read_plan
     from rf3dgs.splats.surface import sample_mesh
 
     mesh = plan_mesh(read_plan(path))

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rf3dgs.geometry.plan import Opening as Opening
     from rf3dgs.geometry.plan import Room as Room
     from rf3dgs.geometry.plan import plan_mesh as plan_mesh
-    from rf3dgs.geometry.plan import read_plan as read_plan
+    from rf3dgs.geometry.plan_file import read_plan as read_plan
     from rf3dgs.geometry.planes import Planes as Planes
     from rf3dgs.geometry.surfaces import Surfaces as Surfaces
     from rf3dgs.geometry.surfaces import find_surfaces as find_surfaces
@@ -31,7 +31,7 @@ _HOMES = {
     "flattened": ".flatten",
     "Room": ".plan",
     "Opening": ".plan",
-    "read_plan": ".plan",
+    "read_plan": ".plan_file",
     "plan_mesh": ".plan",
     "check_geometry": ".check",
     "GeometryReport": ".check",

@@ -1,23 +1,17 @@
 """Floor plans: rooms as polygons with walls, doors and windows, and the mesh that they stand for.
 
-docs/how-to/geometry.md shows the file. Coordinates are metres, z up; a room's corners may run either way round.
+Coordinates are metres, z up; a room's corners may run either way round. `geometry.plan_file` reads plans from files.
 """
 
-import json
-import math
-import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from rf3dgs.core.errors import DataError, InputError
+from rf3dgs.core.errors import InputError
 
-LARGEST_FILE = 1 << 20  # bytes
-MOST_ROOMS, MOST_CORNERS = 1000, 1000
 LARGEST = 2000.0  # [m]
 COLOURS = {
     "concrete": (0.6, 0.6, 0.58),
@@ -30,9 +24,7 @@ COLOURS = {
     "floorboard": (0.5, 0.42, 0.32),
 }
 GREY = (0.5, 0.5, 0.5)
-PLAN_KEYS = ("height", "floor", "ceiling", "walls", "rooms")
-ROOM_KEYS = ("name", "corners", "height", "base", "floor", "ceiling", "walls", "openings")
-OPENING_KEYS = ("wall", "from", "to", "foot", "head", "material")
+Corner = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -81,29 +73,6 @@ class PlanMesh:
     names: tuple[str, ...]
     materials: tuple[str, ...]
     colours: Tensor
-
-
-def read_plan(path: str | Path) -> tuple[Room, ...]:
-    """The rooms of a floor plan in TOML or JSON.
-
-    Raises DataError, naming the file and the place, for a file that is missing, too large or cannot be parsed, for keys
-    that are unknown or missing, for values of the wrong type, and for rooms that no one could build: fewer than three
-    corners, walls that cross, openings outside their wall or over one another.
-    """
-    path = Path(path)
-    try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise DataError(f"{path}: is larger than {LARGEST_FILE >> 20} MiB, too large for a floor plan")
-        text = path.read_bytes().decode("utf-8")
-        table = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
-    except FileNotFoundError as error:
-        raise DataError(f"{path}: there is no such file; name a floor plan in TOML or JSON") from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: cannot be read as a floor plan ({error})") from error
-    try:
-        return _rooms(table)
-    except InputError as error:
-        raise DataError(f"{path}: {error}") from error
 
 
 def plan_mesh(rooms: tuple[Room, ...]) -> PlanMesh:
@@ -166,7 +135,7 @@ def check_room(room: Room) -> None:
     sides = torch.linalg.vector_norm(ring.roll(-1, 0) - ring, dim=-1)
     if float(sides.min()) < 1e-3:
         raise InputError(f"{where} has the same corner twice in a row; name each corner once")
-    if _crosses(ring):
+    if _crosses(room.corners):
         raise InputError(f"{where} has walls that cross; list its corners one after another around it")
     for opening in room.openings:
         what = f"{where}, the opening from {opening.left:g} to {opening.right:g} m"
@@ -222,110 +191,42 @@ def _area(ring: Tensor) -> float:
     return 0.5 * float((ring[:, 0] * after[:, 1] - ring[:, 1] * after[:, 0]).sum())
 
 
-def _turn(a: Tensor, b: Tensor, c: Tensor) -> float:
-    return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+def _turn(a: Corner, b: Corner, c: Corner) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
-def _crosses(ring: Tensor) -> bool:
+def _crosses(ring: Sequence[Corner]) -> bool:
     """Whether two sides that are not neighbours meet."""
     count = len(ring)
     for i in range(count):
         a, b = ring[i], ring[(i + 1) % count]
         for j in range(i + 2, count - (i == 0)):
             c, d = ring[j], ring[(j + 1) % count]
-            if _turn(a, b, c) * _turn(a, b, d) <= 0 and _turn(c, d, a) * _turn(c, d, b) <= 0:
-                apart = (torch.maximum(a, b) < torch.minimum(c, d)) | (torch.maximum(c, d) < torch.minimum(a, b))
-                if not bool(apart.any()):
-                    return True
+            astride = _turn(a, b, c) * _turn(a, b, d) <= 0 and _turn(c, d, a) * _turn(c, d, b) <= 0
+            apart = any(max(a[k], b[k]) < min(c[k], d[k]) or max(c[k], d[k]) < min(a[k], b[k]) for k in (0, 1))
+            if astride and not apart:
+                return True
     return False
 
 
 def _triangles(ring: Tensor) -> Tensor:
     """Triangles `[face, 3]` of a simple anticlockwise polygon, by cutting ears."""
-    left, faces = list(range(len(ring))), []
+    points: list[Corner] = [(x, y) for x, y in ring.tolist()]
+    left, faces = list(range(len(points))), []
     while len(left) > 3:
         corners = [(left[k - 1], left[k], left[(k + 1) % len(left)]) for k in range(len(left))]
-        ears = [place for place, corner in enumerate(corners) if _is_ear(ring, corner, left)]
-        turns = [abs(_turn(*ring[list(corner)])) for corner in corners]
-        place = ears[0] if ears else turns.index(min(turns))
-        faces += [corners[place]] if ears else []
+        place = next((k for k, corner in enumerate(corners) if _is_ear(points, corner, left)), None)
+        if place is None:  # corners in one line are left
+            turns = [abs(_turn(*(points[k] for k in corner))) for corner in corners]
+            place = turns.index(min(turns))
+        else:
+            faces.append(corners[place])
         left.pop(place)
     return torch.tensor([*faces, left])
 
 
-def _is_ear(ring: Tensor, corner: tuple[int, int, int], left: list[int]) -> bool:
-    a, b, c = ring[list(corner)]
+def _is_ear(ring: list[Corner], corner: tuple[int, int, int], left: list[int]) -> bool:
+    a, b, c = (ring[k] for k in corner)
     others = [ring[k] for k in left if k not in corner]
     inside = any(min(_turn(a, b, p), _turn(b, c, p), _turn(c, a, p)) > -1e-12 for p in others)
     return _turn(a, b, c) > 1e-12 and not inside
-
-
-def _rooms(table: Any) -> tuple[Room, ...]:
-    """The rooms of a parsed file."""
-    _known(table, PLAN_KEYS, "the plan")
-    entries = table.get("rooms")
-    if not isinstance(entries, list) or not 1 <= len(entries) <= MOST_ROOMS:
-        raise InputError(f"a floor plan needs a list of 1 to {MOST_ROOMS} rooms ([[rooms]]); got {str(entries)[:40]}")
-    usual = {key: table[key] for key in PLAN_KEYS if key != "rooms" and key in table}
-    rooms = []
-    for number, entry in enumerate(entries):
-        where = f"room {number}"
-        _known(entry, ROOM_KEYS, where)
-        entry = usual | entry
-        corners = entry.get("corners")
-        if not isinstance(corners, list) or not 3 <= len(corners) <= MOST_CORNERS:
-            raise InputError(f"{where}: corners must be a list of three or more [x, y]; got {str(corners)[:40]}")
-        openings = entry.get("openings", [])
-        if not isinstance(openings, list):
-            raise InputError(f"{where}: openings must be a list of tables; got {str(openings)[:40]}")
-        room = Room(
-            name=_text(entry.get("name", f"room-{number}"), f"{where}.name"),
-            corners=tuple(_point(corner, f"{where}.corners") for corner in corners),
-            height=_number(entry.get("height"), f"{where}.height"),
-            base=_number(entry.get("base", 0.0), f"{where}.base"),
-            floor=_text(entry.get("floor", "concrete"), f"{where}.floor"),
-            ceiling=_text(entry.get("ceiling", "ceiling_board"), f"{where}.ceiling"),
-            walls=_text(entry.get("walls", "plasterboard"), f"{where}.walls"),
-            openings=tuple(_opening(value, where) for value in openings),
-        )
-        check_room(room)
-        rooms.append(room)
-    return tuple(rooms)
-
-
-def _opening(entry: Any, where: str) -> Opening:
-    where = f"{where}.openings"
-    _known(entry, OPENING_KEYS, where)
-    wall = entry.get("wall")
-    if type(wall) is not int:
-        raise InputError(f"{where}.wall must be a whole number, the wall's place from 0; got {wall!r}")
-    numbers = {key: _number(entry.get(key), f"{where}.{key}") for key in ("from", "to", "head")}
-    foot = _number(entry.get("foot", 0.0), f"{where}.foot")
-    material = None if "material" not in entry else _text(entry["material"], f"{where}.material")
-    return Opening(wall, numbers["from"], numbers["to"], foot, numbers["head"], material)
-
-
-def _known(entry: Any, keys: tuple[str, ...], where: str) -> None:
-    if not isinstance(entry, dict):
-        raise InputError(f"{where} must be a table; got {str(entry)[:40]!r}")
-    for key in entry:
-        if key not in keys:
-            raise InputError(f"{where} has the unknown key {key!r}; known are {', '.join(keys)}")
-
-
-def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{where} must be a number in metres; got {value!r}")
-    return float(value)
-
-
-def _text(value: Any, where: str) -> str:
-    if not isinstance(value, str):
-        raise InputError(f"{where} must be text; got {value!r}")
-    return value
-
-
-def _point(value: Any, where: str) -> tuple[float, float]:
-    if not isinstance(value, list) or len(value) != 2:
-        raise InputError(f"{where} must be pairs [x, y] in metres; got {str(value)[:40]!r}")
-    return _number(value[0], where), _number(value[1], where)
