@@ -26,7 +26,7 @@ from rf3dgs.cli.facts import open_scene
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.files import write_whole
 from rf3dgs.core.grids import equirect_grid
-from rf3dgs.field.sources import Rays
+from rf3dgs.field.rays import Rays
 from rf3dgs.geometry import find_surfaces
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import stack_spectra

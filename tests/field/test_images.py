@@ -13,7 +13,8 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid, pinhole_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.field.images import image_chain, mirrored, sequences
-from rf3dgs.field.sources import RAY_FIELDS, Marks, PointSources
+from rf3dgs.field.rays import RAY_FIELDS
+from rf3dgs.field.sources import Marks, PointSources
 from rf3dgs.field.ways import Reach
 from rf3dgs.geometry import Patches, Planes
 from rf3dgs.geometry.patches import plane_axes

@@ -8,8 +8,8 @@ if TYPE_CHECKING:
     from rf3dgs.field.lit import LitSurface as LitSurface
     from rf3dgs.field.radiance import Surface as Surface
     from rf3dgs.field.radio_field import RadioField as RadioField
+    from rf3dgs.field.rays import Rays as Rays
     from rf3dgs.field.sources import PointSources as PointSources
-    from rf3dgs.field.sources import Rays as Rays
     from rf3dgs.field.transmitter import estimate_transmitter as estimate_transmitter
     from rf3dgs.field.uncertainty import Uncertainty as Uncertainty
 
@@ -18,7 +18,7 @@ _HOMES = {
     "Surface": ".radiance",
     "LitSurface": ".lit",
     "PointSources": ".sources",
-    "Rays": ".sources",
+    "Rays": ".rays",
     "Uncertainty": ".uncertainty",
     "estimate_transmitter": ".transmitter",
 }

@@ -21,7 +21,8 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid, list_grid, sample_grid, view_of
 from rf3dgs.field.lit import LitSurface
 from rf3dgs.field.radiance import Radiance, Surface
-from rf3dgs.field.sources import PointSources, Rays
+from rf3dgs.field.rays import Rays
+from rf3dgs.field.sources import PointSources
 from rf3dgs.field.uncertainty import Uncertainty, numbers_of
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.peaks import find_peaks

@@ -15,7 +15,7 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import View, view_of
 from rf3dgs.field.lit import BLENDING, LitSurface
 from rf3dgs.field.radiance import NANOSECOND
-from rf3dgs.field.sources import Rays
+from rf3dgs.field.rays import Rays
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.rasterize import Backend, rasterize

@@ -12,7 +12,7 @@ from torch import Tensor
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import View, view_of
-from rf3dgs.field.sources import Rays
+from rf3dgs.field.rays import Rays
 from rf3dgs.spectra.codec import DbWindow, PaperEncoding
 from rf3dgs.spectra.spectrum import Spectrum
 

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
-from rf3dgs.field.sources import Marks, PointSources, Rays
+from rf3dgs.field.rays import Rays
+from rf3dgs.field.sources import Marks, PointSources
 from rf3dgs.field.transmitter import pixel_of
 from rf3dgs.spectra.spectrum import Spectrum
 

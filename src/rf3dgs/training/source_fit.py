@@ -9,7 +9,8 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.field.images import HIGHEST_ORDER
 from rf3dgs.field.moving import with_images as images_among
-from rf3dgs.field.sources import PointSources, Rays
+from rf3dgs.field.rays import Rays
+from rf3dgs.field.sources import PointSources
 from rf3dgs.geometry import Surfaces
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.obstacles import Obstacles

@@ -12,7 +12,8 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.field.lit import BLENDING, LitSurface
 from rf3dgs.field.radio_field import RadioField
-from rf3dgs.field.sources import PointSources, Rays
+from rf3dgs.field.rays import Rays
+from rf3dgs.field.sources import PointSources
 from rf3dgs.field.uncertainty import NUMBERS, SHARES, Uncertainty, floor_db, numbers_of
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from rf3dgs.core.angles import angle_between
 from rf3dgs.field.images import image_chain, mirrored, sequences
-from rf3dgs.field.sources import PointSources, Rays
+from rf3dgs.field.rays import Rays
+from rf3dgs.field.sources import PointSources
 from rf3dgs.field.transmitter import bearing_error, closest_point, pairwise_meetings, pixel_of
 from rf3dgs.geometry import Patches, Planes
 from rf3dgs.geometry.patches import CELL

@@ -1,0 +1,61 @@
+"""Rays: what arrives at a receiver from point sources, and what an instrument there sees of it."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import DirectionGrid
+from rf3dgs.spectra.spectrum import Instrument
+
+RAY_FIELDS = ("index", "power", "arrival", "departure", "delay", "order", "points")
+FARTHEST_LOBES = 3.2  # where a lobe has fallen by 123 dB
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """What arrives at one receiver from k point sources, in the order of the sources.
+
+    index `[k]`: rows of `PointSources.sequence`. power `[k]`: path gains, linear. arrival, departure `[k, 3]`: unit
+    vectors from the receiver and from the transmitter. delay `[k]` [s]. order `[k]`: number of reflections. points
+    `[k, 3, 3]`: where they happen [m], the receiver beyond the last.
+    """
+
+    index: Tensor
+    power: Tensor
+    arrival: Tensor
+    departure: Tensor
+    delay: Tensor
+    order: Tensor
+    points: Tensor
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def only(self, chosen: Tensor) -> "Rays":
+        """Some of the rays: `chosen` is a mask `[k]` or a list of places."""
+        return Rays(*(getattr(self, name)[chosen] for name in RAY_FIELDS))
+
+    def shares(self, pose: Pose, grid: DirectionGrid, instrument: Instrument) -> tuple[Tensor, Tensor, Tensor]:
+        """What an instrument at one `pose` sees of each ray: place in the flattened grid `[n]`, ray `[n]`, power `[n]`.
+
+        Pixels farther than `FARTHEST_LOBES` from a ray are left out.
+        """
+        cut, blocks = min(math.pi, FARTHEST_LOBES * instrument.lobe), grid.blocks
+        arrival = pose.to_device(self.arrival)
+        block, ray = blocks.near(arrival, cut)
+        chord2 = (blocks.directions[block] - arrival[ray, :, None]).square_().sum(1)
+        row, pixel = torch.nonzero(chord2 <= 4.0 * math.sin(0.5 * cut) ** 2, as_tuple=True)
+        place = blocks.pixels[block[row], pixel]
+        within = place >= 0
+        row, pixel, place = row[within], pixel[within], place[within]
+        angle = 2.0 * torch.asin((0.5 * chord2[row, pixel].sqrt()).clamp_max(1.0))
+        ray = ray[row]
+        return place, ray, instrument.kernel(angle) * self.power[ray]
+
+    def picture(self, pose: Pose, grid: DirectionGrid, instrument: Instrument) -> Tensor:
+        """Power `[row, col]`, linear, that the instrument sees at one `pose`."""
+        place, _, share = self.shares(pose, grid, instrument)
+        return share.new_zeros(grid.shape).flatten().index_add_(0, place, share).reshape(grid.shape)
