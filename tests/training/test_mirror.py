@@ -147,3 +147,11 @@ def test_lists_of_directions_are_refused(training):
     listed = measure(training.pose[:3], grid)
     with pytest.raises(InputError, match="needs pinhole or equirectangular spectra"):
         lit_views(listed, None)
+
+
+def test_the_configuration_says_how_many_reflections_are_followed(training):
+    alone = fit_radio(room(), training, replace(MIRROR, mirror_order=0))
+    assert alone.sources is not None
+    assert len(alone.sources) == 1
+    with pytest.raises(InputError, match="order must be from 0 to 3; got 4"):
+        fit_radio(room(), training, replace(MIRROR, mirror_order=4))

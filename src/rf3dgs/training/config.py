@@ -17,6 +17,9 @@ class RadioConfig:
     model: Literal["mirror", "paper"] = "paper"
     """"mirror": the transmitter's mirror images as point sources, and surfaces that scatter by laws of their own;
     "paper": harmonics in a dB window on every Gaussian, the line of sight as a point source."""
+    mirror_order: int | None = None
+    """Most reflections of the mirror images that are point sources beside the transmitter, 3 at most; None is 2 with
+    the mirror model and 0, the line of sight alone, with the paper's."""
     uncertainty: bool = False
     """The mirror model alone: learn how far its levels may be off, by leaving training positions out in turn. It takes
     about three times as long as the rest."""
@@ -33,9 +36,6 @@ class RadioConfig:
     line_of_sight: Literal["source", "surface"] = "source"
     """"source": the transmitter is a point source of its own, its pixels are masked in the surface's training;
     "surface": the Gaussians must show it too, as in the paper."""
-    mirror_order: int = 0
-    """Most reflections of the mirror images that are point sources beside the transmitter; 0 is the line of sight
-    alone."""
     degree: int = 3
     """Degree of the gain's harmonics."""
     floor_db: float | None = None

@@ -18,13 +18,14 @@ from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles, visibility_of
-from rf3dgs.training.config import RadioConfig
+from rf3dgs.training.config import RadioConfig, SourceConfig
 from rf3dgs.training.lit_fit import Scattering, fit_ambient, fit_laws, refine_residual
 from rf3dgs.training.lit_views import LitView, lit_views, observe
 from rf3dgs.training.source_fit import fit_sources
 
 CELL = 0.8  # m
 PASSES = 3
+MIRROR_ORDER = 2  # unless the configuration says otherwise
 DEEPEST_DB = 90.0  # under the window's ceiling; what is darker is the tail of a beam, or directions that no ray reached
 STAGES = ("surfaces", "point sources", "observations", "laws", "residual")
 
@@ -49,7 +50,8 @@ def fit_mirror(
     surfaces = find_surfaces(geometry, positions)
     progress.update(1)
     obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, geometry.opacities, surfaces.plane_of)
-    found = fit_sources(spectra, surfaces, obstacles, tx)
+    order = MIRROR_ORDER if config.mirror_order is None else config.mirror_order
+    found = fit_sources(spectra, surfaces, obstacles, tx, SourceConfig(order=order, seed=config.seed))
     progress.update(2)
     views = lit_views(spectra, found.rays)
     surface = fit_surface(geometry, surfaces, obstacles, views, tx.position, window, config, progress)

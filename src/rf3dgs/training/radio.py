@@ -76,10 +76,10 @@ def fit_radio(
         return _with_uncertainty(field, spectra, progress) if config.uncertainty else field
     found = None
     if config.line_of_sight == "source":
-        with_mirrors = config.mirror_order > 0
-        surfaces = find_surfaces(geometry, spectra.pose.position) if with_mirrors else None
+        order = config.mirror_order or 0
+        surfaces = find_surfaces(geometry, spectra.pose.position) if order else None
         obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, geometry.opacities)
-        mirrors = SourceConfig(order=config.mirror_order, seed=config.seed)
+        mirrors = SourceConfig(order=order, seed=config.seed)
         found = fit_sources(spectra, surfaces, obstacles, where, mirrors)
     span = PaperEncoding.of(spectra).delay_span if config.encoding == "paper" and spectra.delay is not None else 1e-7
     bare = Surface.bare(
