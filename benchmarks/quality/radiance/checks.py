@@ -4,9 +4,10 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from benchmarks.quality.radiance.compare import MUST_NOT_LOSE, MUST_WIN, Estimate
+from benchmarks.quality.radiance.compare import MUST_NOT_LOSE, MUST_WIN
 from benchmarks.quality.radiance.results import Place, Results
 from rf3dgs.evaluation.scores import SCORE, Score
+from rf3dgs.evaluation.table import Estimate
 
 AT = 40
 """Training positions at which the targets hold."""

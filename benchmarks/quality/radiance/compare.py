@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from rf3dgs.evaluation.scores import SCORE, Score
+from rf3dgs.evaluation.table import Estimate
 
 RESAMPLES = 2000
 LEVELS = (2.5, 97.5)
@@ -40,15 +41,6 @@ ROWS: tuple[Score, ...] = (
 MUST_WIN = (PEAK_MEAN, SCORE["beam_loss_peak"], SCORE["beam_loss_eigen"], SCORE["path_gain"])
 MUST_NOT_LOSE = (SCORE["rmse_db"], SCORE["mae_db"], SCORE["delay"], SCORE["departure"])
 """What verdicts are about: means, so that a difference of scores is the mean of paired differences."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A number with its 95 % interval; NaN where there is none."""
-
-    value: float
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.quality.radiance.cells import Key, Values, values_of
-from benchmarks.quality.radiance.compare import Difference, Estimate, difference, estimate, in_common
+from benchmarks.quality.radiance.compare import Difference, difference, estimate, in_common
 from benchmarks.quality.radiance.models import LOOKUPS
 from rf3dgs.evaluation.scores import Score
+from rf3dgs.evaluation.table import Estimate
 
 
 @dataclass(frozen=True, order=True)

@@ -7,8 +7,9 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from benchmarks.quality.radiance.checks import checks
-from benchmarks.quality.radiance.compare import MUST_NOT_LOSE, MUST_WIN, ROWS, Estimate
+from benchmarks.quality.radiance.compare import MUST_NOT_LOSE, MUST_WIN, ROWS
 from benchmarks.quality.radiance.results import Place, Results
+from rf3dgs.evaluation.table import Estimate
 
 WIDTH = 80
 LABEL = 34
