@@ -108,6 +108,27 @@ def test_an_existing_scheduler_is_used_and_left_running(crew, tmp_path):
     assert crew._client.submit(sum, [1, 2]).result() == 3
 
 
+def test_a_greeting_that_comes_with_other_news_is_asked_for_again(crew, tmp_path, monkeypatch):
+    real, asked = distributed.Client, []
+
+    def interrupted(*arguments, **options):
+        asked.append(arguments)
+        if len(asked) <= failures:
+            raise AssertionError  # what a client does when its first batch holds more than the greeting
+        return real(*arguments, **options)
+
+    address = crew._client.scheduler.address
+    monkeypatch.setattr(distributed, "Client", interrupted)
+    failures = 2
+    run_job(FakeJob(), tmp_path, crew=cluster.existing_cluster(address))
+    assert len(asked) == 3
+    assert len(files_of(tmp_path)) == 11
+    failures = 6
+    with pytest.raises(InputError, match=r"no dask scheduler answers at .*\(AssertionError\)"):
+        run_job(FakeJob(), tmp_path, crew=cluster.existing_cluster(address))
+    assert len(asked) == 6
+
+
 def test_a_worker_with_many_threads_makes_one_shard_at_a_time(tmp_path):
     with (
         distributed.LocalCluster(

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 RETRIES = 2
-"""How often a shard that failed by no fault of its arguments is tried again; dead workers are counted by dask (3)."""
+"""How often a connection, or a shard that failed by no fault of its arguments, is tried again; dask counts dead workers
+(3)."""
 PATIENCE = 60.0
 """Seconds without any worker, or without an answer of the scheduler, after which the run gives up."""
 AHEAD = 2
@@ -196,17 +197,27 @@ def existing_cluster(address: str) -> Iterator[DaskCrew]:
     if not address.startswith(("tcp://", "tls://")) or address.count(":") < 2:
         raise InputError(f"a cluster is given as tcp://host:port or tls://host:port; got {address!r}")
     _need_distributed()
+    with _quiet(), _connected(address) as client:
+        yield DaskCrew(client)
+
+
+def _connected(address: str, tries: int = 1 + RETRIES) -> "Client":
+    """A client of the scheduler at `address`; InputError when none answers.
+
+    A client asserts that the first batch it reads holds the greeting alone, but a scheduler that has news for all of
+    its clients in those two milliseconds sends both in one batch: connecting again is all there is to do.
+    """
     from distributed import Client
 
     try:
-        client = Client(address, timeout=PATIENCE / 2)
-    except (OSError, TimeoutError, ValueError) as error:
+        return Client(address, timeout=PATIENCE / 2)
+    except (OSError, TimeoutError, ValueError, AssertionError) as error:
+        if isinstance(error, AssertionError) and tries > 1:
+            return _connected(address, tries - 1)
         raise InputError(
             f"no dask scheduler answers at {address} ({type(error).__name__}); start one with dask scheduler, or look "
             "at the address and the firewall"
         ) from error
-    with _quiet(), client:
-        yield DaskCrew(client)
 
 
 @contextmanager
