@@ -40,5 +40,5 @@ dataset = rf3dgs.Dataset(spectra=spectra).split(test=0.2, region=0.0, seed=0, un
 geometry = sample_mesh(corners, faces, count=3000)
 assert dataset.train.spectra is not None
 assert dataset.test.spectra is not None
-field = rf3dgs.fit_radio(geometry, dataset.train.spectra, RadioConfig(steps=50))
+field = rf3dgs.fit_radio(geometry, dataset.train.spectra, RadioConfig(seed=0))
 print(rf3dgs.evaluate(field, dataset.test.spectra, train=dataset.train.spectra))

@@ -138,7 +138,7 @@ def trained(steps: int) -> dict[str, dict[str, float]]:
     result = {}
     for detail in ("keep", "merge"):
         started = time.process_time()
-        field = fit_radio(geometry, train, RadioConfig(steps=steps, detail=detail))
+        field = fit_radio(geometry, train, RadioConfig(model="paper", steps=steps, detail=detail))
         seconds = time.process_time() - started
         drawn = field.render(validation.pose, validation.grid, csi=False).power
         error = field.window.encode(drawn) - field.window.encode(validation.power)

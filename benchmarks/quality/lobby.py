@@ -33,7 +33,7 @@ def main() -> None:
     assert validation is not None
     assert tx is not None
     given = RadioField.load(folder / "site.field")
-    estimated = fit_radio(geometry, replace(train, tx=None), RadioConfig(steps=0))
+    estimated = fit_radio(geometry, replace(train, tx=None), RadioConfig())
     print(f"transmitter estimated {1e3 * float((estimated.tx.position - tx.position).norm()):.2f} mm off")
     receiver = validation.pose.position.double()
     offset = tx.position.double() - receiver

@@ -40,7 +40,9 @@ def lobby_field(count: int) -> RadioField:
     train = open_dataset("lobby").train.spectra
     assert train is not None
     geometry = geometry_of_mesh(open_scene("lobby"), count, 0)
-    return fit_radio(geometry, train, RadioConfig(steps=0, start="grey", detail="keep", mirror_order=2, csi_every=0))
+    return fit_radio(
+        geometry, train, RadioConfig(model="paper", steps=0, start="grey", detail="keep", mirror_order=2, csi_every=0)
+    )
 
 
 def verdict(value: float, must: float) -> str:

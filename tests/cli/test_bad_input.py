@@ -30,7 +30,7 @@ from rf3dgs.splats.ply import write_ply
 
 COUNT, WIDTH, HEIGHT = 14, 16, 8
 TX = Pose((0.5, 0.5, 2.5))
-FIT = ("--visual.steps", "2", "--visual.start", "random", "--visual.start-count", "50", "--radio.steps", "2")
+FIT = ("--visual.steps", "2", "--visual.start", "random", "--visual.start-count", "50")
 
 
 @dataclass(frozen=True)
@@ -69,15 +69,15 @@ class Site:
             "fit": ["fit", str(self.dataset), "--out", str(self.out / "new.field"), *FIT],
             "fit-radio": [
                 *("fit-radio", str(self.geometry), str(self.dataset)),
-                *("--out", str(self.out / "new.field"), "--radio.steps", "2"),
+                *("--out", str(self.out / "new.field")),
             ],
             "fit-geometry": [
                 *("fit-geometry", str(self.photos), "--out", str(self.out / "new.ply")),
-                *FIT[:6],
+                *FIT,
             ],
             "fit-geometry dataset": [
                 *("fit-geometry", str(self.dataset), "--out", str(self.out / "new.ply")),
-                *FIT[:6],
+                *FIT,
             ],
             "eval": [
                 *("eval", str(self.field), str(self.dataset), "--out", str(self.out / "report.html")),
@@ -154,7 +154,7 @@ def sound(tmp_path_factory) -> Site:
     Dataset(make_photos(site.photos), spectra, meta={"seed": 0}).split(seed=1).save(site.dataset)
     write_ply(site.geometry, Gaussians.random(60, (0, 0, 0), (14, 15, 3), degree=0, seed=4))
     save_paths(make_paths(spectra.pose), site.paths)
-    radio = ["--radio.steps", "2", "--out", str(site.field)]
+    radio = ["--radio.model", "paper", "--radio.steps", "2", "--out", str(site.field)]
     assert main(["fit-radio", str(site.geometry), str(site.dataset), *radio]) == 0
     return site
 

@@ -42,7 +42,7 @@ def box(tmp_path_factory) -> Path:
     assert main(["spectra", str(paths), "--out", str(ideal), "--size", "48", "24"]) == 0
     array = ("--method", "capon", "--array", "4x4", "--snr-db", "20", "--grid", "pinhole", "--size", "24", "16")
     assert main(["spectra", str(paths), "--out", str(capon), *array]) == 0
-    fit = ("--mesh", "box", "--mesh-count", "800", "--radio.steps", "10")
+    fit = ("--mesh", "box", "--mesh-count", "800")
     for name in ("ideal", "capon"):
         assert main(["fit", str(folder / name), "--out", str(folder / f"{name}.field"), *fit]) == 0
     return folder
@@ -99,7 +99,7 @@ def test_render_draws_what_csi_lists(box, tmp_path):
 
 def test_the_transmitter_of_a_mirror_field_moves(box, tmp_path, capsys):
     name, tx = str(tmp_path / "mirror.field"), (-2.0, 3.0, 3.0)
-    fit = ("--mesh", "box", "--mesh-count", "800", "--radio.model", "mirror")
+    fit = ("--mesh", "box", "--mesh-count", "800")
     assert main(["fit", str(box / "ideal"), "--out", name, *fit]) == 0
     capsys.readouterr()
     ask = [name, "--at", *map(str, AT), "--tx", *map(str, tx)]
@@ -157,7 +157,7 @@ def started(site: Path, out: Path) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "rf3dgs", "fit", str(site), "--out", str(out)]
     command += ["--visual.steps", "300", "--visual.start", "random", "--visual.start-count", "60"]
     command += ["--visual.max-count", "120", "--visual.checkpoint-every", "5", "--visual.degree", "1"]
-    command += ["--radio.steps", "300", "--radio.checkpoint-every", "5"]
+    command += ["--radio.model", "paper", "--radio.steps", "300", "--radio.checkpoint-every", "5"]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

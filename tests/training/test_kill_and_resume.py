@@ -67,7 +67,7 @@ spectra = Spectrum(
     10 ** (-8 - 4 * torch.rand(3, 12, 24, generator=generator)), grid, pose, 60e9, Instrument.gaussian(0.4),
     delay=1e-8 * (1 + torch.rand(3, 12, 24, generator=generator)), aod=aod, tx=tx,
 )
-config = RadioConfig(steps=150, checkpoint_every=10)
+config = RadioConfig(model="paper", steps=150, checkpoint_every=10)
 folder = None if checkpoints == "none" else checkpoints
 field = fit_radio(geometry, spectra, config, progress=Slow(), checkpoint_dir=folder)
 seen = field.render(pose, grid)

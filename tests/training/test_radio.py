@@ -1,5 +1,5 @@
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -13,14 +13,14 @@ from rf3dgs.spectra.peaks import main_peak
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.surface import sample_mesh
-from rf3dgs.training.config import RadioConfig
+from rf3dgs.training.config import PAPER_ONLY, PRESETS, RadioConfig
 from rf3dgs.training.loop import TrainingStopped
 from rf3dgs.training.radio import fit_radio
 from rf3dgs.training.radio_views import radio_views
 
 HIGH = (6.0, 5.0, 3.0)
 TX = torch.tensor([1.0, 1.2, 2.4])
-QUICK = RadioConfig(steps=12, backend="reference")
+QUICK = RadioConfig(model="paper", steps=12, backend="reference")
 
 
 def room(spacing: float = 0.4) -> Gaussians:
@@ -278,9 +278,17 @@ def test_merged_geometry_renders_what_the_whole_one_does():
 def test_presets_have_names_and_keep_the_seed():
     assert RadioConfig.preset("paper", seed=4) == RadioConfig.paper(seed=4)
     assert RadioConfig.preset("fast", steps=7).steps == 7
+    assert {RadioConfig.preset(name).model for name in PRESETS} == {"paper"}
     assert RadioConfig.fast().steps < RadioConfig().steps < RadioConfig.best().steps
     with pytest.raises(InputError, match="presets of the radio stage are fast, paper, best; got 'quick'"):
         RadioConfig.preset("quick")
+
+
+def test_settings_of_the_papers_model_are_refused_by_the_mirror_model(training):
+    for changes in ({"steps": 5}, {"degree": 2, "ssim_weight": 0.5}):
+        with pytest.raises(InputError, match=rf"^{', '.join(changes)}: settings of the paper's model; choose model="):
+            fit_radio(room(), training, RadioConfig(**changes))
+    assert set(PAPER_ONLY) < {item.name for item in fields(RadioConfig)}
 
 
 def test_the_core_and_its_specification_train_the_same_field(training):

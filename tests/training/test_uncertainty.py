@@ -162,7 +162,7 @@ def test_too_few_positions_and_other_models_are_refused(field, training):
     with pytest.raises(InputError, match="needs 8 training positions or more, to leave some out; got 5"):
         fit_uncertainty(field, training[:5])
     with pytest.raises(InputError, match="uncertainty belongs to the mirror model"):
-        fit_radio(geometry(), training, RadioConfig(uncertainty=True))
+        fit_radio(geometry(), training, RadioConfig(model="paper", uncertainty=True))
     with pytest.raises(InputError, match="is empty: no power"):
         fit_uncertainty(field, replace(training, power=training.power * 0))
 

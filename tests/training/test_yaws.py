@@ -42,7 +42,7 @@ def test_the_radio_stage_learns_from_four_pictures_of_each_place(dataset, tmp_pa
     assert len(train.spectra) == 24
     assert len(set(stored.places[train.index].tolist())) == 6
     geometry = Gaussians.random(200, (-1, -1, 0), (6, 6, 3), degree=0, seed=3)
-    field = fit_radio(geometry, train.spectra, RadioConfig(steps=20))
+    field = fit_radio(geometry, train.spectra, RadioConfig(model="paper", steps=20))
     test = stored.open_test("a test of the test")
     assert len(test.spectra) == 8
     assert abs(field.sources.level_db) < 1.0, "the level of the line of sight out of the pictures that see it [dB]"

@@ -10,11 +10,11 @@ from rf3dgs.core.errors import InputError
 class RadioConfig:
     """The radio stage: spectra on frozen geometry.
 
-    The settings from `encoding` to `train_opacity` belong to the paper's model, as `steps` and `csi_every` do; the
-    mirror model is fitted in closed form and has none of them.
+    The settings in `PAPER_ONLY` belong to the paper's model; the mirror model, which is fitted in closed form, refuses
+    them.
     """
 
-    model: Literal["mirror", "paper"] = "paper"
+    model: Literal["mirror", "paper"] = "mirror"
     """"mirror": the transmitter's mirror images as point sources, and surfaces that scatter by laws of their own;
     "paper": harmonics in a dB window on every Gaussian, the line of sight as a point source."""
     mirror_order: int | None = None
@@ -28,7 +28,8 @@ class RadioConfig:
     csi_every: int = 2
     """Delay and departure are trained in every n-th iteration; 0 leaves them at their geometric prior."""
     seed: int = 0
-    """Decides the order of the views; the same seed gives the same field, bit by bit, on one machine."""
+    """Decides the search for planes or the order of the views; the same seed gives the same field, bit by bit, on one
+    machine."""
 
     encoding: Literal["vector", "paper"] = "vector"
     """"vector": delay as range / c plus a residual and departure as a unit vector; "paper": the paper's own channels,
@@ -74,9 +75,15 @@ class RadioConfig:
     checkpoint_every: int = 500
     """Iterations between checkpoints when a checkpoint folder is given."""
 
+    @property
+    def of_the_paper(self) -> tuple[str, ...]:
+        """The names of settings that are not at their defaults and that only the paper's model has."""
+        plain = RadioConfig()
+        return tuple(name for name in PAPER_ONLY if getattr(self, name) != getattr(plain, name))
+
     @classmethod
     def preset(cls, name: str, *, steps: int | None = None, seed: int = 0) -> "RadioConfig":
-        """The settings of that name in `PRESETS`, with their own number of steps unless another is given."""
+        """The settings of that name in `PRESETS`, all of the paper's model, with their own steps or those given."""
         if name not in PRESETS:
             raise InputError(f"the presets of the radio stage are {', '.join(PRESETS)}; got {name!r}")
         chosen = replace(PRESETS[name], seed=seed)
@@ -98,9 +105,16 @@ class RadioConfig:
         return cls.preset("paper", steps=steps, seed=seed)
 
 
+PAPER_ONLY = (
+    *("steps", "csi_every", "encoding", "line_of_sight", "degree", "start", "ridge", "lr_level"),
+    *("lr_harmonics", "lr_opacity", "lr_csi", "lr_final", "ssim_weight", "shrink", "train_opacity"),
+)
+"""Settings that the mirror model does not have."""
+
 PRESETS = {
-    "fast": RadioConfig(steps=100, ridge=3.0),
+    "fast": RadioConfig(model="paper", steps=100, ridge=3.0),
     "paper": RadioConfig(
+        model="paper",
         steps=10_000,
         encoding="paper",
         line_of_sight="surface",
@@ -110,7 +124,15 @@ PRESETS = {
         lr_opacity=5e-2,
         lr_csi=5.6e-3,
     ),
-    "best": RadioConfig(steps=2_000, ridge=3.0, lr_level=3e-4, lr_harmonics=6e-5, lr_opacity=1.5e-3, ssim_weight=0.0),
+    "best": RadioConfig(
+        model="paper",
+        steps=2_000,
+        ridge=3.0,
+        lr_level=3e-4,
+        lr_harmonics=6e-5,
+        lr_opacity=1.5e-3,
+        ssim_weight=0.0,
+    ),
 }
 
 

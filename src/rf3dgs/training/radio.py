@@ -55,6 +55,10 @@ def fit_radio(
     progress = Silent() if progress is None else progress
     if config.steps < 0:
         raise InputError(f"steps must be 0 (the closed-form start alone) or more; got {config.steps}")
+    if config.model == "mirror" and config.of_the_paper:
+        raise InputError(
+            f'{", ".join(config.of_the_paper)}: settings of the paper\'s model; choose model="paper" or leave them out'
+        )
     if config.uncertainty and config.model != "mirror":
         raise InputError('uncertainty belongs to the mirror model; choose model="mirror" or leave it out')
     geometry.check()
