@@ -190,8 +190,8 @@ class VisualConfig:
 
     walls: Literal["flat", "free"] = "flat"
     """"flat": at a tenth and at two fifths of the run large planes are moved to where the photographs agree, those that
-    bound the site are filled, and their Gaussians are flat from then on; "free": the published method, which leaves
-    haze there."""
+    bound the site are filled, and their Gaussians are flat from then on, which needs a world in metres; "free": the
+    published method, which leaves haze there."""
 
     backend: Literal["auto", "native", "reference", "gsplat"] = "auto"
     """Which rasterizer works."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import matrix_from_quaternion
 from rf3dgs.core.grids import Camera
 from rf3dgs.geometry.flatten import THICKNESS, TRUSTED, onto_planes
@@ -36,11 +37,12 @@ FLOATS = 0.3  # before a plane that bounds the site: what is nearer and on no pl
 DIM = 0.05  # to this opacity
 MARGIN = 0.5  # planes are filled up to this far beyond what lies on any [m]
 EDGE = 0.05  # and this far beyond one another [m]
+MOST_PLACES = 250_000  # of larger planes the drawings are coarser
 STRIDE = 3  # fillings stand so many steps of the drawings apart
 FILLED_OPACITY = 0.7
 SEEN = 3  # photographs that must look at a place that is filled
 DISAGREE = 0.2  # a place on which photographs agree less than this is not on the plane
-MOST_SIGHTS = 64
+MOST_SIGHTS = 100  # photographs that are compared, evenly spread over all
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +99,12 @@ def flatten_walls(
     if len(gaussians) < LEAST:
         return None
     eyes = torch.stack([camera.position for camera in cameras])
-    surfaces = find_surfaces(gaussians, eyes)
+    try:
+        surfaces = find_surfaces(gaussians, eyes)
+    except InputError:  # planes of a square kilometre: the world is not in metres, and no distance here means anything
+        return None
+    spread = slice(None, None, -(-len(cameras) // MOST_SIGHTS))
+    cameras, pictures = cameras[spread], pictures[spread]
     planes, agreed = refine_planes(gaussians, _squared(gaussians, surfaces), surfaces.patches, cameras, pictures)
     trusted = agreed > TRUSTED
     if not bool(trusted.any()):
@@ -105,9 +112,9 @@ def flatten_walls(
     plane_of = _pulled(gaussians, surfaces, planes, trusted)
     flat = onto_planes(gaussians, plane_of, planes)
     bounds = trusted & _bounds(flat, planes, plane_of, eyes)
-    flat = _dimmed(flat, planes, plane_of, bounds)
-    spread = range(0, len(cameras), -(-len(cameras) // MOST_SIGHTS))
-    sights = [Sight.of(flat, cameras[index], pictures[index]) for index in spread]
+    untried = torch.cat((agreed.isnan(), agreed.new_zeros(1, dtype=torch.bool)))[surfaces.plane_of]
+    flat = _dimmed(flat, planes, (plane_of < 0) & ~untried, bounds)
+    sights = [Sight.of(flat, camera, picture) for camera, picture in zip(cameras, pictures, strict=True)]
     filling, on = _filling(flat, sights, surfaces, planes, plane_of, bounds)
     room = max(0, most - len(flat))
     if len(on) > room:
@@ -150,10 +157,10 @@ def _bounds(gaussians: Gaussians, planes: Planes, plane_of: Tensor, eyes: Tensor
     return ahead & (behind.float().mean(0) < BEHIND)
 
 
-def _dimmed(gaussians: Gaussians, planes: Planes, plane_of: Tensor, bounds: Tensor) -> Gaussians:
-    """The Gaussians, faint where they are on no plane and close before or anywhere behind one that bounds the site."""
-    away = (gaussians.means @ planes.normals[bounds].mT - planes.offsets[bounds]).amin(-1) if bool(bounds.any()) else 0
-    dim = (plane_of < 0) & (torch.as_tensor(away) < FLOATS) & bool(bounds.any())
+def _dimmed(gaussians: Gaussians, planes: Planes, loose: Tensor, bounds: Tensor) -> Gaussians:
+    """The Gaussians, the `loose` ones `[gaussian]` faint where they are close before or behind a plane of `bounds`."""
+    away = gaussians.means @ planes.normals[bounds].mT - planes.offsets[bounds]
+    dim = loose & (away < FLOATS).any(-1)
     ceiling = math.log(DIM / (1 - DIM))
     logits = torch.where(dim, gaussians.logit_opacities.clamp_max(ceiling), gaussians.logit_opacities)
     return replace(gaussians, logit_opacities=logits)
@@ -164,14 +171,14 @@ def _filling(
 ) -> tuple[Gaussians, Tensor]:
     """New Gaussians where planes that bound the site have holes, and the plane of each."""
     walls = bounds.nonzero().squeeze(-1).tolist()
-    points, on = [torch.zeros(0, 3)], [torch.zeros(0, dtype=torch.long)]
-    colours = [torch.zeros(0, 3)]
     site = gaussians.means[plane_of >= 0]
+    parts, on = [gaussians.subset(torch.zeros(0, dtype=torch.long))], [torch.zeros(0, dtype=torch.long)]
     for plane in walls:
         normal = planes.normals[plane]
         axes = plane_axes(normal[None])[0]
         low, high = (site @ axes.mT).amin(0) - MARGIN, (site @ axes.mT).amax(0) + MARGIN
-        spans = [torch.arange(float(a), float(b), STEP) for a, b in zip(low, high, strict=True)]
+        step = max(STEP, math.sqrt(float((high - low).prod()) / MOST_PLACES))
+        spans = [torch.arange(float(a), float(b), step) for a, b in zip(low, high, strict=True)]
         place = torch.stack(torch.meshgrid(*spans, indexing="ij"), -1) @ axes + planes.offsets[plane] * normal
         alike, seen = agreement_at(sights, place, normal)
         others = [wall for wall in walls if wall != plane]
@@ -179,15 +186,19 @@ def _filling(
         empty = inside & (seen >= SEEN) & ~(alike < DISAGREE)
         chosen = place[1::STRIDE, 1::STRIDE][empty[1::STRIDE, 1::STRIDE]]
         chosen = chosen[~surfaces.patches.holds(chosen, torch.tensor(plane))]
-        points.append(chosen)
-        colours.append(colours_at(sights, chosen, normal) if len(chosen) else chosen)
+        colours = colours_at(sights, chosen, normal)
+        parts.append(_pieces(chosen, normal, 0.6 * STRIDE * step, colours, gaussians.sh.shape[1]))
         on.append(torch.full((len(chosen),), plane))
-    place, of = torch.cat(points), torch.cat(on)
-    flat = torch.tensor([0.6 * STRIDE * STEP, 0.6 * STRIDE * STEP, THICKNESS]).log().expand(len(place), 3)
-    sh = gaussians.sh.new_zeros(len(place), *gaussians.sh.shape[1:])
-    sh[:, 0] = (torch.cat(colours) - 0.5) / C0
-    logits = torch.full((len(place),), math.log(FILLED_OPACITY / (1 - FILLED_OPACITY)))
-    return Gaussians(place, upright(planes.normals[of]), flat.clone(), logits, sh), of
+    return Gaussians.join(parts), torch.cat(on)
+
+
+def _pieces(points: Tensor, normal: Tensor, size: float, colours: Tensor, coefficients: int) -> Gaussians:
+    """Flat Gaussians of a `size` [m] on points `[point, 3]` of a plane, of the `colours` `[point, 3]`."""
+    log_scales = torch.tensor([size, size, THICKNESS]).log().repeat(len(points), 1)
+    sh = torch.zeros(len(points), coefficients, 3)
+    sh[:, 0] = (colours - 0.5) / C0
+    logits = torch.full((len(points),), math.log(FILLED_OPACITY / (1 - FILLED_OPACITY)))
+    return Gaussians(points, upright(normal.expand(len(points), 3)), log_scales, logits, sh)
 
 
 def _product(first: Tensor, second: Tensor) -> Tensor:
