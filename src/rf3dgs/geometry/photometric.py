@@ -8,7 +8,6 @@ not matter. Collins (1996) with the plane itself as the space that is swept.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import torch
 from torch import Tensor
@@ -32,6 +31,14 @@ MOST_PHOTOS = 16
 MARGIN = 0.5  # what lies this far beside a patch, within the site, is looked at too [m]
 SWEEP = 0.06  # [m]
 ROUNDS = 3
+ALONE = ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
+WAYS = (
+    *ALONE,
+    (-1, -1, 0),
+    (-1, 1, 0),
+    (1, -1, 0),
+    (1, 1, 0),
+)  # of offset and tilts; pictures hang to one side of walls
 LARGEST = 8.0  # of larger planes the middle is looked at, up to this size [m]
 LEAST_AGREEMENT = 0.005  # gain in agreement below which a plane stays where it is
 TILT_COST = 0.004  # and what a tilt must gain for each degree: from afar and from one height tilts hardly show
@@ -134,9 +141,10 @@ def _refine(
         before = -1.0
         while best > before + LEAST_AGREEMENT:
             before = best
-            for axis, sign in product((0, 1, 2), (-1, 1)):
-                changed = [value + sign * step[axis] * (place == axis) for place, value in enumerate(move)]
-                trial = agreement(changed) if abs(changed[axis]) <= limit[axis] + 1e-6 else 0.0
+            for way in WAYS:
+                changed = [value + sign * size for value, sign, size in zip(move, way, step, strict=True)]
+                allowed = all(abs(value) <= most + 1e-6 for value, most in zip(changed, limit, strict=True))
+                trial = agreement(changed) if allowed else 0.0
                 if trial > best:
                     best, move = trial, changed
         step = [value / 2 for value in step]

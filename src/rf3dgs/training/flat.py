@@ -19,7 +19,7 @@ from rf3dgs.core.frames import matrix_from_quaternion
 from rf3dgs.core.grids import Camera
 from rf3dgs.geometry.flatten import THICKNESS, TRUSTED, onto_planes
 from rf3dgs.geometry.layers import squared
-from rf3dgs.geometry.patches import plane_axes
+from rf3dgs.geometry.patches import Patches, footprints, plane_axes
 from rf3dgs.geometry.photometric import STEP, Sight, agreement_at, colours_at, refine_planes
 from rf3dgs.geometry.planes import Planes
 from rf3dgs.geometry.surfaces import Surfaces, find_surfaces
@@ -29,6 +29,7 @@ from rf3dgs.splats.harmonics import C0
 from rf3dgs.training.initial import upright
 
 LEAST = 100  # fewer Gaussians have no planes
+SAME_DIRECTION, SAME_PLACE = 0.996, 0.10  # planes within 5 degrees and so many metres of each other are one
 PULL = 0.10  # what lies so near a plane, turned like it, belongs to it [m]
 PULL_COSINE = 0.5
 AHEAD = 0.2  # all cameras are so far before a plane that bounds the site [m]
@@ -38,6 +39,7 @@ DIM = 0.05  # to this opacity
 MARGIN = 0.5  # planes are filled up to this far beyond what lies on any [m]
 EDGE = 0.05  # and this far beyond one another [m]
 MOST_PLACES = 250_000  # of larger planes the drawings are coarser
+OPAQUE, LARGEST_SPOT = 0.3, 0.3  # what covers a plane: fainter Gaussians do not, and only so far from their centre [m]
 STRIDE = 3  # fillings stand so many steps of the drawings apart
 FILLED_OPACITY = 0.7
 SEEN = 3  # photographs that must look at a place that is filled
@@ -89,12 +91,11 @@ class Flats:
 
 
 def flatten_walls(
-    gaussians: Gaussians, cameras: Sequence[Camera], pictures: Sequence[Tensor], most: int
+    gaussians: Gaussians, cameras: Sequence[Camera], pictures: Sequence[Tensor]
 ) -> tuple[Change, Flats] | None:
     """Find the planes on which photographs agree, and make the Gaussians into their surfaces; None where there is none.
 
-    `pictures` are bytes `[row, col, 3]` of the `cameras`; no more than `most` Gaussians come out, unless there are more
-    already.
+    `pictures` are bytes `[row, col, 3]` of the `cameras`.
     """
     if len(gaussians) < LEAST:
         return None
@@ -109,17 +110,15 @@ def flatten_walls(
     trusted = agreed > TRUSTED
     if not bool(trusted.any()):
         return None
+    surfaces = replace(surfaces, plane_of=_merged(gaussians, surfaces.plane_of, planes, agreed))
+    trusted &= torch.bincount(surfaces.plane_of[surfaces.plane_of >= 0], minlength=len(planes)) > 0
     plane_of = _pulled(gaussians, surfaces, planes, trusted)
     flat = onto_planes(gaussians, plane_of, planes)
     bounds = trusted & _bounds(flat, planes, plane_of, eyes)
     untried = torch.cat((agreed.isnan(), agreed.new_zeros(1, dtype=torch.bool)))[surfaces.plane_of]
     flat = _dimmed(flat, planes, (plane_of < 0) & ~untried, bounds)
     sights = [Sight.of(flat, camera, picture) for camera, picture in zip(cameras, pictures, strict=True)]
-    filling, on = _filling(flat, sights, surfaces, planes, plane_of, bounds)
-    room = max(0, most - len(flat))
-    if len(on) > room:
-        kept = torch.linspace(0, len(on) - 1, room).long()
-        filling, on = filling.subset(kept), on[kept]
+    filling, on = _filling(flat, sights, planes, plane_of, bounds)
     source = torch.cat((torch.arange(len(flat)), torch.zeros(len(on), dtype=torch.long)))
     change = Change(Gaussians.join([flat, filling]), source, torch.arange(len(source)) >= len(flat))
     return change, Flats(planes, torch.cat((plane_of, on)))
@@ -134,6 +133,26 @@ def _squared(gaussians: Gaussians, surfaces: Surfaces) -> Planes:
         offsets[plane] = gaussians.means[surfaces.plane_of == plane].mean(0) @ (normals[plane] - planes.normals[plane])
     offsets[1:] += planes.offsets[1:]
     return Planes(normals, offsets)
+
+
+def _merged(gaussians: Gaussians, plane_of: Tensor, planes: Planes, agreed: Tensor) -> Tensor:
+    """The plane of each Gaussian, where photographs moved planes to one place that on which they agree best."""
+    plane_of = plane_of.clone()
+    kept: list[int] = []
+    for plane in agreed.nan_to_num(-1.0).argsort(descending=True, stable=True).tolist():
+        if not bool(agreed[plane] > TRUSTED):
+            break
+        normal, mine = planes.normals[plane], plane_of == plane
+        middle = gaussians.means[mine].mean(0)
+        middle = middle + (planes.offsets[plane] - middle @ normal) * normal
+        alike = (planes.normals[kept] @ normal > SAME_DIRECTION) & (
+            (planes.normals[kept] @ middle - planes.offsets[kept]).abs() < SAME_PLACE
+        )
+        if bool(alike.any()):
+            plane_of[mine] = kept[int(alike.nonzero()[0])]
+        else:
+            kept.append(plane)
+    return plane_of
 
 
 def _pulled(gaussians: Gaussians, surfaces: Surfaces, planes: Planes, trusted: Tensor) -> Tensor:
@@ -167,15 +186,15 @@ def _dimmed(gaussians: Gaussians, planes: Planes, loose: Tensor, bounds: Tensor)
 
 
 def _filling(
-    gaussians: Gaussians, sights: Sequence[Sight], surfaces: Surfaces, planes: Planes, plane_of: Tensor, bounds: Tensor
+    gaussians: Gaussians, sights: Sequence[Sight], planes: Planes, plane_of: Tensor, bounds: Tensor
 ) -> tuple[Gaussians, Tensor]:
     """New Gaussians where planes that bound the site have holes, and the plane of each."""
     walls = bounds.nonzero().squeeze(-1).tolist()
     site = gaussians.means[plane_of >= 0]
     parts, on = [gaussians.subset(torch.zeros(0, dtype=torch.long))], [torch.zeros(0, dtype=torch.long)]
     for plane in walls:
-        normal = planes.normals[plane]
-        axes = plane_axes(normal[None])[0]
+        one = Planes(planes.normals[[plane]], planes.offsets[[plane]])
+        normal, axes = one.normals[0], plane_axes(one.normals)[0]
         low, high = (site @ axes.mT).amin(0) - MARGIN, (site @ axes.mT).amax(0) + MARGIN
         step = max(STEP, math.sqrt(float((high - low).prod()) / MOST_PLACES))
         spans = [torch.arange(float(a), float(b), step) for a, b in zip(low, high, strict=True)]
@@ -185,11 +204,18 @@ def _filling(
         inside = (place @ planes.normals[others].mT - planes.offsets[others] > -EDGE).all(-1)
         empty = inside & (seen >= SEEN) & ~(alike < DISAGREE)
         chosen = place[1::STRIDE, 1::STRIDE][empty[1::STRIDE, 1::STRIDE]]
-        chosen = chosen[~surfaces.patches.holds(chosen, torch.tensor(plane))]
+        chosen = chosen[~Patches.of(one, [_spots(gaussians, plane_of == plane)]).holds(chosen, torch.tensor(0))]
         colours = colours_at(sights, chosen, normal)
         parts.append(_pieces(chosen, normal, 0.6 * STRIDE * step, colours, gaussians.sh.shape[1]))
         on.append(torch.full((len(chosen),), plane))
     return Gaussians.join(parts), torch.cat(on)
+
+
+def _spots(gaussians: Gaussians, mine: Tensor) -> Tensor:
+    """Points `[point, 3]` over the footprints of the flat Gaussians `mine` that are opaque."""
+    part = gaussians.subset(mine & (gaussians.opacities >= OPAQUE))
+    axes = matrix_from_quaternion(part.quats)[:, :, :2]  # `onto_planes` puts the thin one last
+    return footprints(part.means, axes, part.scales[:, :2].clamp_max(LARGEST_SPOT)).flatten(0, 1)
 
 
 def _pieces(points: Tensor, normal: Tensor, size: float, colours: Tensor, coefficients: int) -> Gaussians:

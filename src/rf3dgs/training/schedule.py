@@ -8,7 +8,7 @@ from rf3dgs.training.config import VisualConfig
 PUBLISHED_STEPS = 30_000
 LARGEST_HASTE = 4.0
 SHORT_DEPTH_WEIGHT = 0.5
-FLATTEN_AT = (0.1, 0.4)
+FLATTEN_AT = (0.3, 0.5)
 
 
 @dataclass(frozen=True)

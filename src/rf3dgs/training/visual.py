@@ -195,7 +195,7 @@ class VisualStage:
                 source = seen.nonzero().squeeze(-1)
                 self._follow(trainer, Change(now.subset(source), source, torch.zeros(len(source), dtype=torch.bool)))
         if schedule.flattens_after(iteration):
-            found = flatten_walls(trainer.gaussians(), self.cameras, self.pictures, config.max_count)
+            found = flatten_walls(trainer.gaussians(), self.cameras, self.pictures)
             if found is not None:
                 self.flats = found[1]
                 trainer.follow(found[0])
