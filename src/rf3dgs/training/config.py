@@ -189,7 +189,7 @@ class VisualConfig:
     grows; None: 0.5 for the shortest runs, less for longer ones, down to the published method's 0 at 30,000 steps."""
 
     walls: Literal["flat", "free"] = "flat"
-    """"flat": at a tenth and at two fifths of the run large planes are moved to where the photographs agree, those that
+    """"flat": after three tenths and half of the run large planes are moved to where the photographs agree, those that
     bound the site are filled, and their Gaussians are flat from then on, which needs a world in metres; "free": the
     published method, which leaves haze there."""
 
