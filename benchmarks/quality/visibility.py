@@ -1,11 +1,11 @@
 """Gates against the mesh: how often a segment through the Gaussians is open where the mesh blocks it, and the reverse.
 
-    python -m benchmarks.quality.visibility
+    python -m benchmarks.quality.visibility [geometry.ply ...]
 
 Segments in the built-in lobby: from the transmitter to receivers, between receivers, and from receivers to points on
 large surfaces, whose own plane is skipped. The truth is cast exactly against the triangles. Gaussians are sampled on
-the mesh, and those that photographs trained (the geometry of the shipped field). The plane of a Gaussian is the mesh's
-own within 10 cm and 25 degrees, so that the table shows the gates and not who finds planes.
+the mesh, and those that photographs trained (the geometry of the shipped field, or of the files named). The plane of a
+Gaussian is the mesh's own within 10 cm and 25 degrees, so that the table shows the gates and not who finds planes.
 
 How near a silhouette a segment is: the least distance by which it can be shifted so that the truth changes, looked for
 in eight directions. Printed for each gate and threshold: the share of blocked segments that are open, of free ones that
@@ -15,6 +15,7 @@ are closed, of all that are wrong, and how many of the wrong ones have a silhoue
 import argparse
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -24,7 +25,7 @@ from rf3dgs.cli.facts import open_field
 from rf3dgs.propagation.sites.lobby import lobby
 from rf3dgs.propagation.sites.scene import Scene
 from rf3dgs.splats.obstacles import Obstacles
-from rf3dgs.splats.surface import normals
+from rf3dgs.splats.ply import read_ply
 
 THRESHOLDS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5)
 LARGE = 3.0  # m^2: planes with less surface reflect little
@@ -153,6 +154,7 @@ def percent(part: Tensor, whole: Tensor) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("files", nargs="*", type=Path, help="geometries; without any that of the shipped field")
     parser.add_argument("--count", type=int, default=4000, help="segments of each kind")
     parser.add_argument("--gaussians", type=int, default=100_000, help="on the mesh")
     parser.add_argument("--radii", type=float, nargs="*", default=[0.02, 0.05], help="of soft gates [m]")
@@ -160,15 +162,15 @@ def main() -> None:
     scene = lobby()
     vertices, faces, _ = scene.mesh()
     corners = vertices[faces].float()
-    mesh, field = geometry_of_mesh(scene, wish.gaussians, 0), open_field("lobby")
-    trained = field.surface
-    subjects = {
-        f"mesh, {len(mesh)}": (mesh.means, mesh.quats, mesh.scales, mesh.opacities, normals(mesh)),
-        f"photographs, {len(trained)}": (
-            *(trained.means, trained.quats, trained.scales, field.solidity),
-            shortest_axis(trained.quats, trained.scales),
-        ),
-    }
+    mesh = geometry_of_mesh(scene, wish.gaussians, 0)
+    subjects = {f"mesh, {len(mesh)}": subject(mesh.means, mesh.quats, mesh.scales, mesh.opacities)}
+    if not wish.files:
+        field = open_field("lobby")
+        part = field.surface
+        subjects[f"photographs, {len(part)}"] = subject(part.means, part.quats, part.scales, field.solidity)
+    for file in wish.files:
+        part = read_ply(file)
+        subjects[f"{file.stem}, {len(part)}"] = subject(part.means, part.quats, part.scales, part.opacities)
     kinds = all_legs(scene, corners, wish.count)
     truths = {name: free(legs.start, legs.end, corners) for name, legs in kinds.items()}
     near = {name: silhouette(legs, truths[name], corners) for name, legs in kinds.items()}
@@ -189,6 +191,11 @@ def main() -> None:
                     shares += (percent(wrong, torch.ones_like(wrong)),)
                     shares += tuple(percent(wrong & (distance <= limit), wrong) for limit in (0.05, 0.15))
                     print(f"| | {geometry} | {gate} | {threshold} | {' | '.join(shares)} |", flush=True)
+
+
+def subject(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> tuple[Tensor, ...]:
+    """Gaussians as the gates need them, with the shortest axis of each."""
+    return means, quats, scales, opacities, shortest_axis(quats, scales)
 
 
 def shortest_axis(quats: Tensor, scales: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -33,7 +33,7 @@ class FitGeometry:
     """The 3DGS .ply to write."""
     poses: Literal["given", "sfm"] = "given"
     """"sfm" finds poses and first points from the JPEG and PNG files below the folder by structure from motion (extra
-    sfm); their world has arbitrary scale and tilt."""
+    sfm); their world has arbitrary scale and tilt, so that walls stay free (--visual.walls)."""
     lens: Literal["radial", "pinhole"] = "radial"
     """With --poses sfm: estimate a radial distortion, or take rendered and undistorted pictures as they are."""
     mesh: str | None = None
@@ -78,8 +78,9 @@ class FitGeometry:
             roles = found.roles or ("train",) * len(found.photos)
             photos = [photo for photo, role in zip(found.photos, roles, strict=True) if role == "train"]
             with_checkpoints = checkpoints(self.out)
+            visual = replace(self.visual, walls="free") if self.poses == "sfm" else self.visual
             geometry = fit_geometry(
-                photos, self.visual, initial=found.points, progress=console(), checkpoint_dir=with_checkpoints
+                photos, visual, initial=found.points, progress=console(), checkpoint_dir=with_checkpoints
             )
             geometry = flat_on_planes(geometry, photos) if self.flatten else geometry
         write_ply(self.out, geometry)
@@ -186,8 +187,6 @@ def fit_field(
     source: str = "the geometry",
 ) -> None:
     """Train the radio stage with checkpoints, save the field, and say how large it is; `source` names the geometry."""
-    from dataclasses import replace
-
     from rf3dgs.cli.chain import gaussian_count
     from rf3dgs.training.radio import fit_radio
 

@@ -45,10 +45,19 @@ def flattened(gaussians: Gaussians, surfaces: Surfaces, planes: Planes, chosen: 
 
     Each is moved along the normal; its two longer axes are projected onto the plane, and across it it becomes thin.
     """
-    mine = (surfaces.plane_of >= 0) & chosen[surfaces.plane_of.clamp_min(0)] if len(planes) else surfaces.plane_of >= 0
+    chosen = torch.cat((chosen, chosen.new_zeros(1)))  # the last one is that of plane -1
+    return onto_planes(gaussians, torch.where(chosen[surfaces.plane_of], surfaces.plane_of, -1), planes)
+
+
+def onto_planes(gaussians: Gaussians, plane_of: Tensor, planes: Planes) -> Gaussians:
+    """The Gaussians, each moved along the normal onto its plane `plane_of` `[gaussian]` (-1: none) and made flat there.
+
+    Its two longer axes are projected onto the plane; across it it is `THICKNESS` thin.
+    """
+    mine = plane_of >= 0
     if not bool(mine.any()):
         return gaussians
-    normal, offset = planes.normals[surfaces.plane_of[mine]], planes.offsets[surfaces.plane_of[mine]]
+    normal, offset = planes.normals[plane_of[mine]], planes.offsets[plane_of[mine]]
     means = gaussians.means.clone()
     means[mine] -= ((means[mine] * normal).sum(-1) - offset)[:, None] * normal
     axes = matrix_from_quaternion(gaussians.quats[mine]) * gaussians.scales[mine][:, None]

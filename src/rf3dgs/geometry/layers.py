@@ -50,7 +50,7 @@ def find_layers(cloud: Cloud, rest: Tensor, found: Sequence[Found], config: Surf
             if int(main.sum()) < 3:
                 break
             points, mass = cloud.points[main], cloud.mass[main]
-            normal = _squared(fitted(points, mass, layer.normal)[0], found[0].normal)
+            normal = squared(fitted(points, mass, layer.normal)[0], found[0].normal)
             layer = replace(layer, normal=normal, offset=(mass * (points @ normal)).sum() / mass.sum())
         kept, _, _ = cloud.pieces(layer.normal, rest & cloud.lies(layer))
         area = cloud.area(layer.normal, kept)
@@ -85,8 +85,8 @@ def _is_layer(
     return mass >= config.min_cover * area and mass >= LAYER_SHARP * float(cloud.mass[wide | main].sum())
 
 
-def _squared(normal: Tensor, largest: Tensor) -> Tensor:
-    """The `normal` `[3]`, made square to that of the largest plane where it is so within 5 degrees."""
+def squared(normal: Tensor, largest: Tensor) -> Tensor:
+    """The `normal` `[3]`, made square to that of the `largest` plane where it is so within 5 degrees."""
     along = float(normal @ largest)
     if abs(along) > (1 - SAME_DIRECTION**2) ** 0.5:
         return normal

@@ -8,7 +8,6 @@ not matter. Collins (1996) with the plane itself as the space that is swept.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import torch
 from torch import Tensor
@@ -24,23 +23,44 @@ from rf3dgs.splats.gaussians import Gaussians
 STEP = 0.06  # of the drawings on a plane [m]
 WINDOW = 9  # steps
 LEAST_CONTRAST = 0.015  # a flatter window says nothing
+OPEN, NOTHING = 0.5, 1e4  # a pixel drawn with less weight hides nothing: its depth is this [m]
 GRAZING = 0.2  # cosine below which a photograph sees a plane too flatly
+OFF_DEPTH = 0.05  # a photograph that draws another depth, by this share, shows another colour
 HIDDEN = 0.85  # what is drawn nearer than this share of the plane's distance hides it
 MOST_PHOTOS = 16
 MARGIN = 0.5  # what lies this far beside a patch, within the site, is looked at too [m]
 SWEEP = 0.06  # [m]
 ROUNDS = 3
+ALONE = ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1))
+WAYS = (
+    *ALONE,
+    (-1, -1, 0),
+    (-1, 1, 0),
+    (1, -1, 0),
+    (1, 1, 0),
+)  # of offset and tilts; pictures hang to one side of walls
 LARGEST = 8.0  # of larger planes the middle is looked at, up to this size [m]
 LEAST_AGREEMENT = 0.005  # gain in agreement below which a plane stays where it is
+TILT_COST = 0.004  # and what a tilt must gain for each degree: from afar and from one height tilts hardly show
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """A photograph as the refinement needs it: camera, grey picture `[row, col]`, drawn depth `[row, col]` [m]."""
+    """A photograph as the refinement needs it: camera, picture (bytes `[row, col, 3]`), the same in grey (0 to 1,
+    `[row, col]`), and the depth that is drawn there `[row, col]` [m].
+    """
 
     camera: Camera
+    picture: Tensor
     grey: Tensor
     depth: Tensor
+
+    @classmethod
+    def of(cls, gaussians: Gaussians, camera: Camera, picture: Tensor) -> "Sight":
+        """The photograph, with the depth of the Gaussians."""
+        raster = draw(gaussians, camera, depth=True, compositing=Compositing(depth_gate=0.3, normalise=True))
+        depth = torch.where(raster.weight > OPEN, raster.values[..., -1], NOTHING)
+        return cls(camera, picture, picture.float().mean(-1) / 255.0, depth)
 
 
 def refine_planes(
@@ -59,7 +79,7 @@ def refine_planes(
     `pictures` are bytes `[row, col, 3]`. Planes with less than `min_area` [m^2] stay. Returns the planes and how well
     the photographs agree on each, 0 to 1, NaN where it was not tried or nothing is seen.
     """
-    sights = [_sight(gaussians, camera, picture) for camera, picture in zip(cameras, pictures, strict=True)]
+    sights = [Sight.of(gaussians, camera, picture) for camera, picture in zip(cameras, pictures, strict=True)]
     normals, offsets = planes.normals.clone(), planes.offsets.clone()
     agreed = torch.full((len(planes),), math.nan)
     low, high = torch.quantile(gaussians.means, torch.tensor([0.01, 0.99]), dim=0)
@@ -72,11 +92,6 @@ def refine_planes(
         if found is not None:
             normals[plane], offsets[plane], agreed[plane] = found
     return Planes(normals, offsets), agreed
-
-
-def _sight(gaussians: Gaussians, camera: Camera, picture: Tensor) -> Sight:
-    raster = draw(gaussians, camera, depth=True, compositing=Compositing(depth_gate=0.3, normalise=True))
-    return Sight(camera, picture.float().mean(-1) / 255.0, raster.values[..., -1])
 
 
 def _refine(
@@ -112,7 +127,7 @@ def _refine(
         pivot = centre @ axes + (offset + move[0]) * normal
         points = (local - centre) @ axes
         points = points - (points @ turned)[..., None] * turned + pivot
-        return agreement_on(sights, points, turned)
+        return agreement_on(sights, points, turned) - TILT_COST * math.degrees(abs(move[1]) + abs(move[2]))
 
     best, move = agreement((0.0, 0.0, 0.0)), [0.0, 0.0, 0.0]
     first = best
@@ -126,9 +141,10 @@ def _refine(
         before = -1.0
         while best > before + LEAST_AGREEMENT:
             before = best
-            for axis, sign in product((0, 1, 2), (-1, 1)):
-                changed = [value + sign * step[axis] * (place == axis) for place, value in enumerate(move)]
-                trial = agreement(changed) if abs(changed[axis]) <= limit[axis] + 1e-6 else 0.0
+            for way in WAYS:
+                changed = [value + sign * size for value, sign, size in zip(move, way, step, strict=True)]
+                allowed = all(abs(value) <= most + 1e-6 for value, most in zip(changed, limit, strict=True))
+                trial = agreement(changed) if allowed else 0.0
                 if trial > best:
                     best, move = trial, changed
         step = [value / 2 for value in step]
@@ -157,15 +173,7 @@ def _best_sights(sights: Sequence[Sight], centre: Tensor, normal: Tensor) -> lis
 
 def agreement_on(sights: Sequence[Sight], points: Tensor, normal: Tensor) -> float:
     """How alike the photographs are on a plane's points `[row, col, 3]`: mean correlation of windows over all pairs."""
-    total, squares = torch.zeros(points.shape[:2]), torch.zeros(points.shape[:2])
-    count = torch.zeros(points.shape[:2])
-    for sight in sights:
-        values, seen = _drawn(sight, points, normal)
-        mean = _window(values)
-        spread = (_window(values.square()) - mean.square()).clamp_min(0.0).sqrt()
-        clear = seen & (spread > LEAST_CONTRAST) & (_window(seen.float()) > 0.99)
-        signal = torch.where(clear, (values - mean) / spread.clamp_min(1e-6), 0.0).clamp(-3, 3)
-        total, squares, count = total + signal, squares + signal.square(), count + clear
+    total, squares, count, _ = _compared(sights, points, normal)
     several = count >= 2
     if int(several.sum()) < WINDOW**2:
         return 0.0
@@ -173,20 +181,64 @@ def agreement_on(sights: Sequence[Sight], points: Tensor, normal: Tensor) -> flo
     return float(pairs / ((count - 1) * squares)[several].sum().clamp_min(1e-6))
 
 
-def _drawn(sight: Sight, points: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-    """A photograph's grey at points `[row, col, 3]`, and where it sees them."""
+def agreement_at(sights: Sequence[Sight], points: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
+    """How alike the photographs are at each of a plane's points `[row, col, 3]`, and how many see it.
+
+    The first is NaN where fewer than two photographs have anything to compare.
+    """
+    total, squares, count, seen = _compared(sights, points, normal)
+    pairs, most = _window(total.square() - squares), _window((count - 1).clamp_min(0.0) * squares)
+    return torch.where(most > 1e-6, pairs / most.clamp_min(1e-6), math.nan), seen
+
+
+def colours_at(sights: Sequence[Sight], points: Tensor, normal: Tensor) -> Tensor:
+    """The colours `[point, 3]`, 0 to 1, of a plane's points `[point, 3]` in the photographs that see them.
+
+    Near photographs count more, and those that draw the plane's own depth there; 0.5 where none sees a point.
+    """
+    total, weight = torch.full((len(points), 3), 1e-9 / 2), torch.full((len(points), 1), 1e-9)
+    for sight in sights:
+        where, z, drawn, seen = _seen(sight, points[None], normal)
+        picture = sight.picture.permute(2, 0, 1)[None].float() / 255.0
+        colour = grid_sample(picture, where[None], align_corners=False, padding_mode="border")[0, :, 0].mT
+        off = ((drawn / z.clamp_min(1e-3) - 1) / OFF_DEPTH).clamp(-3, 3)
+        share = torch.where(seen, 1 / (z.clamp_min(0.2).square() * (1 + off.square())), 0.0)[0, :, None]
+        total, weight = total + share * colour, weight + share
+    return total / weight
+
+
+def _compared(sights: Sequence[Sight], points: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Sum and sum of squares of the photographs' normalised local contrast at points `[row, col, 3]`, how many have
+    any there, and how many see them.
+    """
+    total, squares, count, views = (torch.zeros(points.shape[:2]) for _ in range(4))
+    for sight in sights:
+        where, _, _, seen = _seen(sight, points, normal)
+        values = grid_sample(sight.grey[None, None], where[None], align_corners=False, padding_mode="border")[0, 0]
+        mean = _window(values)
+        spread = (_window(values.square()) - mean.square()).clamp_min(0.0).sqrt()
+        clear = seen & (spread > LEAST_CONTRAST) & (_window(seen.float()) > 0.99)
+        signal = torch.where(clear, (values - mean) / spread.clamp_min(1e-6), 0.0).clamp(-3, 3)
+        total, squares, count = total + signal, squares + signal.square(), count + clear
+        views = views + seen
+    return total, squares, count, views
+
+
+def _seen(sight: Sight, points: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Where points `[row, col, 3]` are in a photograph (`grid_sample`'s two numbers), their depth and what is drawn
+    there [m], and whether the photograph sees them.
+    """
     camera = sight.camera
     x, y, z = (points @ camera.viewmat[:3, :3].mT + camera.viewmat[:3, 3]).unbind(-1)
     depth = z.clamp_min(1e-3)
     column = (camera.K[0, 0] * x / depth + camera.K[0, 2]) * (2 / camera.width) - 1
     row = (camera.K[1, 1] * y / depth + camera.K[1, 2]) * (2 / camera.height) - 1
     where = torch.stack((column, row), -1)
-    both = torch.stack((sight.grey, sight.depth))[None]
-    grey, drawn = grid_sample(both, where[None], align_corners=False, padding_mode="border")[0]
+    drawn = grid_sample(sight.depth[None, None], where[None], align_corners=False, padding_mode="border")[0, 0]
     towards = camera.position - points
     cosine = (towards @ normal) / torch.linalg.vector_norm(towards, dim=-1).clamp_min(1e-6)
     inside = (where.abs() < 1).all(-1) & (z > 0.2)
-    return grey, inside & (cosine > GRAZING) & (drawn > HIDDEN * z)
+    return where, z, drawn, inside & (cosine > GRAZING) & (drawn > HIDDEN * z)
 
 
 def _window(values: Tensor) -> Tensor:

@@ -179,11 +179,15 @@ class Trainer:
 
     def assign(self, name: str, values: Tensor) -> None:
         """Set one parameter from outside, such as opacities that are reset; its moments begin anew."""
-        if name not in FIELDS or values.shape != self._engine.read(name).shape:
-            raise InputError(f"assign takes one of {', '.join(FIELDS)} in its own shape; got {name!r}")
-        self._engine.write(name, values.detach())
+        self.place(name, values)
         for moment in self._moments(name):
             self._engine.write(moment, torch.zeros_like(values))
+
+    def place(self, name: str, values: Tensor) -> None:
+        """Correct one parameter from outside by a little, such as means moved back onto a plane; its moments stay."""
+        if name not in FIELDS or values.shape != self._engine.read(name).shape:
+            raise InputError(f"a parameter is one of {', '.join(FIELDS)} in its own shape; got {name!r}")
+        self._engine.write(name, values.detach())
 
     def follow(self, change: Change) -> None:
         """Go on with a changed population: moments follow their Gaussians, fresh ones begin anew, the density too."""

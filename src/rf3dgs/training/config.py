@@ -210,6 +210,11 @@ class VisualConfig:
     """First weight of the relative error of the drawn depth against the sweep's, which falls to 0 while the population
     grows; None: 0.5 for the shortest runs, less for longer ones, down to the published method's 0 at 30,000 steps."""
 
+    walls: Literal["flat", "free"] = "flat"
+    """"flat": after three tenths and half of the run large planes are moved to where the photographs agree, those that
+    bound the site are filled, and their Gaussians are flat from then on, which needs a world in metres; "free": the
+    published method, which leaves haze there."""
+
     backend: Literal["auto", "native", "reference", "gsplat"] = "auto"
     """Which rasterizer works."""
     checkpoint_every: int = 1_000

@@ -8,6 +8,7 @@ from rf3dgs.training.config import VisualConfig
 PUBLISHED_STEPS = 30_000
 LARGEST_HASTE = 4.0
 SHORT_DEPTH_WEIGHT = 0.5
+FLATTEN_AT = (0.3, 0.5)
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class Schedule:
     haste: float
     """Short runs learn faster: learning rates are multiplied by this, see `VisualConfig`."""
     depth_weight: float
+    flatten_at: tuple[int, ...]
 
     @classmethod
     def of(cls, config: VisualConfig) -> "Schedule":
@@ -55,6 +57,7 @@ class Schedule:
             depth_weight=SHORT_DEPTH_WEIGHT * max(0.0, 1 - steps / PUBLISHED_STEPS)
             if config.depth_weight is None
             else config.depth_weight,
+            flatten_at=tuple(max(1, round(share * steps)) for share in FLATTEN_AT) if config.walls == "flat" else (),
             haste=min(LARGEST_HASTE, max(1.0, (PUBLISHED_STEPS / steps) ** 0.5)),
         )
 
@@ -79,6 +82,17 @@ class Schedule:
         """Whether the population changes after an iteration."""
         done = iteration + 1
         return self.densify_from <= done <= self.densify_until and done % self.densify_every == 0
+
+    def flattens_after(self, iteration: int) -> bool:
+        """Whether planes are found after an iteration."""
+        return iteration + 1 in self.flatten_at
+
+    def holds_after(self, iteration: int) -> bool:
+        """Whether the Gaussians of planes are put back onto them after an iteration: as often as growth, and at the
+        end.
+        """
+        done = iteration + 1
+        return bool(self.flatten_at) and (done == self.steps or done % self.densify_every == 0)
 
     def resets_after(self, iteration: int) -> bool:
         """Whether opacity is reset after an iteration."""

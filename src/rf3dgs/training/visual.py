@@ -2,7 +2,7 @@
 
 Each iteration compares one photograph with its rendering, L1 + D-SSIM, and moves everything by Adam. Pictures begin
 at a quarter of their resolution. The population grows where the picture pulls at the Gaussians' positions, and loses
-those that are faint, oversized, or seen by no photograph.
+those that are faint, oversized, or seen by no photograph. Walls are held flat where the photographs have them (`flat`).
 """
 
 import dataclasses
@@ -25,6 +25,7 @@ from rf3dgs.splats.target import Target
 from rf3dgs.splats.trainer import Trainer
 from rf3dgs.training.checkpoint import State, fingerprint
 from rf3dgs.training.config import VisualConfig
+from rf3dgs.training.flat import Flats, flatten_walls
 from rf3dgs.training.initial import camera_box, random_start, swept_start
 from rf3dgs.training.loop import random_at, train, view_at
 from rf3dgs.training.photographs import blending_weights, clamp_needles, depth_error, picture_of, shrunk
@@ -93,6 +94,7 @@ class VisualStage:
         self.depths: list[Tensor] = []
         self.targets: dict[tuple[int, int], tuple[Camera, Target]] = {}
         self.trainer: Trainer | None = None
+        self.flats: Flats | None = None
 
     def begin(self) -> Trainer:
         """Make the first Gaussians; a run that goes on from a checkpoint needs none."""
@@ -170,7 +172,7 @@ class VisualStage:
         )
 
     def _change_population(self, trainer: Trainer, iteration: int) -> None:
-        """Grow, prune and reset opacity where the schedule says so."""
+        """Grow, prune, flatten and reset opacity where the schedule says so."""
         config, schedule = self.config, self.schedule
         if schedule.densifies_after(iteration):
             limits_size = 2 * iteration >= schedule.densify_from + schedule.densify_until
@@ -185,15 +187,29 @@ class VisualStage:
                 opacity_floor=config.prune_opacity,
                 largest_scale=config.prune_size * self.extent if limits_size else None,
             )
-            trainer.follow(change)
+            self._follow(trainer, change)
         if schedule.prunes_unseen_after(iteration) and config.prune_unseen > 0:
             now = trainer.gaussians()
             seen = blending_weights(now, self.cameras, backend=config.backend) >= config.prune_unseen
             if bool(seen.any()):
                 source = seen.nonzero().squeeze(-1)
-                trainer.follow(Change(now.subset(source), source, torch.zeros(len(source), dtype=torch.bool)))
+                self._follow(trainer, Change(now.subset(source), source, torch.zeros(len(source), dtype=torch.bool)))
+        if schedule.flattens_after(iteration):
+            found = flatten_walls(trainer.gaussians(), self.cameras, self.pictures)
+            if found is not None:
+                self.flats = found[1]
+                trainer.follow(found[0])
+        if schedule.holds_after(iteration) and self.flats is not None:
+            for name, value in self.flats.held(trainer.gaussians()).tensors().items():
+                if name in ("means", "quats", "log_scales"):
+                    trainer.place(name, value)
         if schedule.resets_after(iteration):
             trainer.assign("logit_opacities", reset_opacity(trainer.gaussians()).logit_opacities)
+
+    def _follow(self, trainer: Trainer, change: Change) -> None:
+        """Go on with a changed population, the planes' own too."""
+        trainer.follow(change)
+        self.flats = None if self.flats is None else self.flats.followed(change)
 
     def _bounded(self, gaussians: Gaussians, iteration: int) -> Gaussians:
         """While depths guide the surfaces, no Gaussian is a needle or larger than a piece of surface."""
@@ -202,10 +218,12 @@ class VisualStage:
         return gaussians
 
     def state(self) -> State:
-        """Parameters, moments and density statistics, and the depths of the sweep."""
+        """Parameters, moments and density statistics, the depths of the sweep, and the planes."""
         trainer = self.trainer or self.begin()
         tensors = {f"trainer.{name}": tensor for name, tensor in trainer.state().items()}
-        return State(tensors | {f"depth.{view}": depth for view, depth in enumerate(self.depths)}, {})
+        tensors |= {f"depth.{view}": depth for view, depth in enumerate(self.depths)}
+        flats = {} if self.flats is None else self.flats.tensors()
+        return State(tensors | {f"flat.{name}": tensor for name, tensor in flats.items()}, {})
 
     def restore(self, state: State) -> None:
         """Continue from what `state()` gave."""
@@ -217,3 +235,5 @@ class VisualStage:
 
         self.trainer = Trainer.resume(group("trainer."), train=TRAINED, backend=self.config.backend)
         self.depths = [depth for _, depth in sorted(group("depth.").items(), key=lambda item: int(item[0]))]
+        flats = group("flat.")
+        self.flats = Flats.from_tensors(flats) if flats else None
