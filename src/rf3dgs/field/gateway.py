@@ -101,6 +101,11 @@ class GatewayField:
             self.waves.responses(places) + kernel(places, self.places, self.length).to(torch.complex128) @ self.weights
         )
 
+    def of_sources(self) -> "GatewayField":
+        """What the sources alone send: the same field without the rest."""
+        nothing = (torch.zeros_like(self.weights), torch.zeros_like(self.covariance))
+        return replace(self, weights=nothing[0], covariance=nothing[1])
+
     def doubt(self, places: Tensor) -> Tensor:
         """The share `[place]` of the rest's power that is not known there: about 0 at training places, 1 far away."""
         near = kernel(_checked(places), self.places, self.length)

@@ -25,8 +25,8 @@ from rf3dgs.training.phase_retrieval import element_responses, sampled
 
 RANGES = (1.02, 1.2, 1.5, 2.0, 3.0, 5.0)  # distance of an image over that of the transmitter
 BEARINGS = 240
-ROUNDS = 30  # of coordinate descent over the phases
-TWIN_ROUNDS = 4
+ROUNDS = 12  # of coordinate descent over the phases
+TWIN_ROUNDS = 2
 Choice = tuple[int, float, float]
 
 
@@ -34,13 +34,13 @@ Choice = tuple[int, float, float]
 class GatewayConfig:
     """What may be tried; the best of it on left-out blocks of the training places is taken."""
 
-    sources: tuple[int, ...] = (0, 1, 2, 3, 4)
+    sources: tuple[int, ...] = (0, 1, 2, 4)
     """How many sources, the transmitter itself first; the most may take a second."""
     lengths: tuple[float, ...] = (0.15, 0.3, 0.6)
     """How far the rest is alike [wavelengths]."""
     noises: tuple[float, ...] = (0.01, 0.1)
     """The share of the rest's power that does not belong to its place."""
-    blocks: int = 4
+    blocks: int = 3
     """Into how many blocks the training places are cut."""
     steps: int = 60
     """Quasi-Newton steps after each new source."""
