@@ -7,7 +7,8 @@ The response of the elements q_m to a transmitter at p is a sum of waves and a r
 s_0(p) = p is the transmitter itself, s_k(p) its mirror image in the plane half way between the mean place and the image
 s_k, which is D_k from the array. r is a zero-mean complex Gaussian process, as diffuse fields are: its covariance is
 `covariance` over the elements times Matern's kernel of order 3/2 over the distance between places. What it does not
-know of a place adds to the power in every direction as much as the rest is known to have there.
+know of a place adds to the power in every direction as much as the rest is known to have there. Pictures are each
+divided by something; the logarithm of that is kriged too, over half the length, as it follows power.
 """
 
 import math
@@ -23,6 +24,7 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid
 from rf3dgs.core.units import wavelength
 
+GAIN_LENGTH = 0.5  # of the kernel's own length
 DIRECT = 1e-6  # [m] an image this near the mean place is the transmitter itself
 
 
@@ -82,7 +84,8 @@ class GatewayField:
     """A fitted field: `responses` is complex, `render` gives amplitudes as measured pictures have them.
 
     places `[n, 3]`: where it was trained. weights `[n, element]`: K^-1 times the rest seen there. inverse `[n, n]`:
-    K^-1, noise included. covariance `[element, element]` of the rest. length [m] of the kernel.
+    K^-1, noise included. covariance `[element, element]` of the rest. gains `[n]`: likewise, of the logarithms of the
+    pictures' gains. length [m] of the kernel.
     """
 
     pose: Pose
@@ -92,6 +95,7 @@ class GatewayField:
     weights: Tensor
     inverse: Tensor
     covariance: Tensor
+    gains: Tensor
     length: float
 
     def responses(self, places: Tensor) -> Tensor:
@@ -111,10 +115,14 @@ class GatewayField:
         near = kernel(_checked(places), self.places, self.length)
         return (1.0 - ((near @ self.inverse) * near).sum(-1)).clamp(0.0, 1.0)
 
+    def gain(self, places: Tensor) -> Tensor:
+        """What a picture taken there would have been multiplied with `[place]`; 1 far from training places."""
+        return torch.exp(kernel(_checked(places), self.places, GAIN_LENGTH * self.length) @ self.gains)
+
     def render(self, places: Tensor, grid: DirectionGrid) -> Tensor:
         """Amplitudes `[place, row, col]`, float32, towards the directions of `grid` (device frame).
 
-        sqrt(|a^H h|^2 + doubt a^H R a): the root of the expected power, in the unit of the training pictures.
+        gain sqrt(|a^H h|^2 + doubt a^H R a): the root of the expected power, in the unit of the training pictures.
         """
         A = manifold(self.array, grid.directions.double().reshape(-1, 3)).conj()
         return self.seen(places, A).reshape(len(places), *grid.shape).float()
@@ -123,7 +131,7 @@ class GatewayField:
         """The same `[place, direction]`, float64, for rows a(u)^H `[direction, element]`."""
         known = (self.responses(places) @ A.mT).abs().square()
         ambient = ((A @ self.covariance) * A.conj()).sum(-1).real.clamp_min(0.0)
-        return (known + self.doubt(places)[:, None] * ambient).sqrt()
+        return self.gain(places)[:, None] * (known + self.doubt(places)[:, None] * ambient).sqrt()
 
 
 def _checked(places: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Fit a `GatewayField`: responses out of pictures, then sources that explain them, then what the sources leave over.
 
-Nobody knows the phase and gain of a picture: all responses are given one length, the mean; sources are fitted by how
-parallel their sum m_i is to the responses h_i,
+Nobody knows the phase and gain of a picture: all responses are given one length, and what they were multiplied with is
+left to the field's gain. Sources are fitted by how parallel their sum m_i is to the responses h_i,
 
     loss = 1 - mean_i |<h_i, m_i>|^2 / (|h_i|^2 |m_i|^2)
 
@@ -20,7 +20,7 @@ from torch import Tensor
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.units import wavelength
 from rf3dgs.data.formats.gateway import GatewaySpectra
-from rf3dgs.field.gateway import GatewayField, Waves, element_places, kernel
+from rf3dgs.field.gateway import GAIN_LENGTH, GatewayField, Waves, element_places, kernel
 from rf3dgs.training.phase_retrieval import element_responses, sampled
 
 RANGES = (1.02, 1.2, 1.5, 2.0, 3.0, 5.0)  # distance of an image over that of the transmitter
@@ -69,18 +69,19 @@ def fit_gateway(spectra: GatewaySpectra, config: GatewayConfig | None = None) ->
     if len(spectra) < 8:
         raise InputError(f"a field needs pictures of at least 8 transmitter places; got {len(spectra)}")
     responses, misfits = element_responses(spectra, seed=config.seed)
-    length = torch.linalg.vector_norm(responses, dim=-1, keepdim=True)
-    responses = responses * (length.mean() / length)
+    length = torch.linalg.vector_norm(responses, dim=-1)
+    loudness = length.log() - length.log().mean()
+    responses = responses / loudness.exp()[:, None]
     tried = list(product(sorted(set(config.sources)), config.lengths, config.noises))
-    errors = _errors(spectra, responses, tried, config) if len(tried) > 1 else {}
+    errors = _errors(spectra, responses, loudness, tried, config) if len(tried) > 1 else {}
     choice = min(errors, key=lambda key: errors[key]) if errors else tried[0]
     ladder = _ladder(spectra, responses, choice[0], config.steps)
-    field = with_rest(spectra, *ladder[-1], choice[1] * wavelength(spectra.frequency), choice[2])
+    field = with_rest(spectra, *ladder[-1], loudness, choice[1] * wavelength(spectra.frequency), choice[2])
     return GatewayFit(field, choice, errors, float(misfits.median()))
 
 
 def _errors(
-    spectra: GatewaySpectra, responses: Tensor, tried: list[Choice], config: GatewayConfig
+    spectra: GatewaySpectra, responses: Tensor, loudness: Tensor, tried: list[Choice], config: GatewayConfig
 ) -> dict[Choice, float]:
     """The root mean square error of amplitude at blocks that took no part in the fit, for each choice."""
     A, pictures = sampled(spectra)
@@ -92,7 +93,7 @@ def _errors(
         ladder = _ladder(part, responses[kept], max(config.sources), config.steps)
         for choice in tried:
             count, length, noise = choice
-            field = with_rest(part, *ladder[count], length * wavelength(spectra.frequency), noise)
+            field = with_rest(part, *ladder[count], loudness[kept], length * wavelength(spectra.frequency), noise)
             off = field.seen(spectra.places[left_out], A) - pictures[left_out]
             total[choice] += float(off.square().mean(-1).sum())
     return {choice: (value / len(spectra)) ** 0.5 for choice, value in total.items()}
@@ -170,8 +171,13 @@ def misalignment(model: Tensor, responses: Tensor) -> Tensor:
     return (1.0 - parallel / (responses.abs().square().sum(-1) * model.abs().square().sum(-1)).clamp_min(1e-30)).mean()
 
 
-def with_rest(spectra: GatewaySpectra, responses: Tensor, waves: Waves, length: float, noise: float) -> GatewayField:
-    """The field of these sources and of a Gaussian process of kernel `length` [m] through what they leave over."""
+def with_rest(
+    spectra: GatewaySpectra, responses: Tensor, waves: Waves, loudness: Tensor, length: float, noise: float
+) -> GatewayField:
+    """The field of these sources and of a Gaussian process of kernel `length` [m] through what they leave over.
+
+    loudness `[place]`: the logarithm of what each picture's response was divided by.
+    """
     places = spectra.places.double()
     model = waves.responses(places)
     gram = kernel(places, places, length) + noise * torch.eye(len(places), dtype=torch.float64)
@@ -184,7 +190,9 @@ def with_rest(spectra: GatewaySpectra, responses: Tensor, waves: Waves, length: 
     rest = torch.from_numpy(_settled(turned.numpy(), model.numpy(), inverse.numpy())) - model
     covariance = rest.mT @ rest.conj() / len(rest)
     weights = inverse.to(torch.complex128) @ rest
-    return GatewayField(spectra.pose, spectra.array, waves, places, weights, inverse, covariance, length)
+    near = kernel(places, places, GAIN_LENGTH * length) + noise * torch.eye(len(places), dtype=torch.float64)
+    gains = torch.linalg.solve(near, loudness)
+    return GatewayField(spectra.pose, spectra.array, waves, places, weights, inverse, covariance, gains, length)
 
 
 def _settled(responses: np.ndarray, model: np.ndarray, inverse: np.ndarray) -> np.ndarray:
