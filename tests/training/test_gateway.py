@@ -15,7 +15,8 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.units import wavelength
 from rf3dgs.data.formats.gateway import GatewaySpectra, hemisphere_grid
 from rf3dgs.field.gateway import GatewayField, Waves, element_places, kernel
-from rf3dgs.training.gateway_fit import GatewayConfig, blocks_of, fit_gateway, twins_of
+from rf3dgs.training.gateway_fit import GatewayConfig, blocks_of, fit_gateway
+from rf3dgs.training.gateway_sources import twins_of
 from rf3dgs.training.phase_retrieval import element_responses, tree
 
 FREQUENCY = 915e6
@@ -171,3 +172,12 @@ def test_too_few_pictures_and_wrong_places_are_refused(near: GatewaySpectra, fie
         element_responses(near[[0]])
     with pytest.raises(InputError, match=r"places must be \[place, 3\]"):
         field.doubt(torch.zeros(3))
+
+
+def test_settings_that_mean_nothing_are_refused() -> None:
+    with pytest.raises(InputError, match=r"sources must be counts to try, such as \(0, 2\); got \(\)"):
+        GatewayConfig(sources=())
+    with pytest.raises(InputError, match="lengths and noises must be above 0"):
+        GatewayConfig(lengths=(0.0,))
+    with pytest.raises(InputError, match="blocks must be 2 or more"):
+        GatewayConfig(blocks=1)
