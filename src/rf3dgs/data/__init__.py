@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from rf3dgs.data.formats.colmap import read_colmap as read_colmap
     from rf3dgs.data.formats.colmap import write_colmap as write_colmap
     from rf3dgs.data.formats.detect import read_photos as read_photos
+    from rf3dgs.data.formats.gateway import GatewaySpectra as GatewaySpectra
+    from rf3dgs.data.formats.gateway import read_gateway as read_gateway
     from rf3dgs.data.formats.nerfstudio import read_nerfstudio as read_nerfstudio
     from rf3dgs.data.formats.nerfstudio import write_nerfstudio as write_nerfstudio
     from rf3dgs.data.formats.rf3dgs_v0 import read_rf3dgs_v0 as read_rf3dgs_v0
@@ -46,6 +48,8 @@ _MODULES = {
     "write_nerfstudio": ".formats.nerfstudio",
     "read_blender": ".formats.blender",
     "read_rf3dgs_v0": ".formats.rf3dgs_v0",
+    "GatewaySpectra": ".formats.gateway",
+    "read_gateway": ".formats.gateway",
     "photos_of_video": ".video",
     "poses_from_photos": ".sfm",
     "Similarity": ".align",
@@ -68,6 +72,8 @@ __all__ = [  # noqa: RUF022
     "write_nerfstudio",
     "read_blender",
     "read_rf3dgs_v0",
+    "GatewaySpectra",
+    "read_gateway",
     "photos_of_video",
     "poses_from_photos",
     "Similarity",

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from rf3dgs.core.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from rf3dgs.field.gateway import GatewayField as GatewayField
     from rf3dgs.field.lit import LitSurface as LitSurface
     from rf3dgs.field.radiance import Surface as Surface
     from rf3dgs.field.radio_field import RadioField as RadioField
@@ -21,6 +22,16 @@ _HOMES = {
     "Rays": ".rays",
     "Uncertainty": ".uncertainty",
     "estimate_transmitter": ".transmitter",
+    "GatewayField": ".gateway",
 }
-__all__ = ["RadioField", "Surface", "LitSurface", "PointSources", "Rays", "Uncertainty", "estimate_transmitter"]  # noqa: RUF022 (reading order)
+__all__ = [  # noqa: RUF022 (reading order)
+    "RadioField",
+    "Surface",
+    "LitSurface",
+    "PointSources",
+    "Rays",
+    "Uncertainty",
+    "estimate_transmitter",
+    "GatewayField",
+]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -9,6 +9,9 @@ if TYPE_CHECKING:
     from rf3dgs.training.checkpoint import State as State
     from rf3dgs.training.config import RadioConfig as RadioConfig
     from rf3dgs.training.config import VisualConfig as VisualConfig
+    from rf3dgs.training.gateway_fit import GatewayConfig as GatewayConfig
+    from rf3dgs.training.gateway_fit import GatewayFit as GatewayFit
+    from rf3dgs.training.gateway_fit import fit_gateway as fit_gateway
     from rf3dgs.training.loop import TrainingStopped as TrainingStopped
     from rf3dgs.training.loop import train as train
     from rf3dgs.training.photographs import render_photo as render_photo
@@ -25,6 +28,9 @@ __all__ = [  # noqa: RUF022 (reading order)
     "fit_radio",
     "refine_field",
     "fit_uncertainty",
+    "GatewayConfig",
+    "GatewayFit",
+    "fit_gateway",
     "train",
     "TrainingStopped",
     "State",
@@ -41,6 +47,9 @@ __getattr__, __dir__ = lazy_names(
         "fit_radio": ".radio",
         "refine_field": ".refine",
         "fit_uncertainty": ".uncertainty_fit",
+        "GatewayConfig": ".gateway_fit",
+        "GatewayFit": ".gateway_fit",
+        "fit_gateway": ".gateway_fit",
         "train": ".loop",
         "TrainingStopped": ".loop",
         "State": ".checkpoint",
