@@ -4,10 +4,11 @@
 
 FOLDER holds traced paths of the lobby (`rf3dgs trace lobby --preset realistic --rx.count 480 --out FOLDER`). Positions
 are split as by `benchmarks.quality.radiance`; trained is on positions of its pool, judged by ideal spectra at its
-validation positions, at random and in the region. At every training position an array of 8x8 patches is turned to
-four sides and sounded: noise, and elements that see --fov degrees of height. Its pictures, by each method, are what
-fields are fitted to, on the same Gaussians of the scene's own mesh, so that only the instrument differs. Diffuse paths
-are merged before they are sounded, in cells of 3 degrees and one resolution of delay; ideal spectra are made of all.
+validation positions, at random and in the region. At every training position an array of 8x8 patches is turned to four
+sides and sounded: noise, and elements that see --fov degrees of height. Its pictures, by each method, are what fields
+are fitted to, on the same Gaussians of the scene's own mesh, so that only the instrument differs. Covariances are
+averaged forward and backward. Diffuse paths are merged before they are sounded, in cells of 3 degrees and one
+resolution of delay; ideal spectra are made of all.
 """
 
 import argparse
@@ -35,7 +36,8 @@ from rf3dgs.evaluation.scores import SCORE
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.propagation.sounder import Sounder, sound
 from rf3dgs.spectra.codec import DbWindow, window_of
-from rf3dgs.spectra.path_targets import path_targets
+from rf3dgs.spectra.config import Loading
+from rf3dgs.spectra.path_lists import path_targets
 from rf3dgs.spectra.sage import sage
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.sounded import spectrum_of_sounding
@@ -84,8 +86,10 @@ def ideal_of(reader: PathsReader, index: list[int], grid: DirectionGrid) -> Spec
 
 def field_of(kind: str, target: Spectrum | Sounding, geometry: Gaussians, options: argparse.Namespace) -> RadioField:
     """The mirror field fitted to what one instrument shows."""
-    config = RadioConfig(model="mirror", floor_db=options.floor_db, array_grid=tuple(options.grid))
-    config = RadioConfig(**{**vars(config), "array_rounds": options.rounds})
+    grid = tuple(options.grid)
+    config = RadioConfig(
+        model="mirror", floor_db=options.floor_db, array_grid=grid, array_rounds=options.rounds, seed=options.seed
+    )
     return fit_radio(geometry, shown(kind, target, options), config)
 
 
@@ -96,7 +100,9 @@ def shown(kind: str, target: Spectrum | Sounding, options: argparse.Namespace) -
     if kind == "sage":
         return path_targets(sage(target, limit=MOST_PATHS, untold="ahead"), target, equirect_grid(*options.grid))
     width, height = options.picture
-    return spectrum_of_sounding(target, pinhole_grid(width, height, 110), method=kind)
+    loading = Loading(options.loading) if kind == "capon" else None
+    how = {"averaging": "forward-backward", "loading": loading}
+    return spectrum_of_sounding(target, pinhole_grid(width, height, 110), method=kind, **how)
 
 
 def scores(field: RadioField, truth: dict[str, Spectrum], window: DbWindow) -> dict[str, dict[str, float]]:
@@ -119,6 +125,7 @@ def main() -> None:
     parser.add_argument("--fov", type=float, default=90.0, help="vertical field of view of the elements [deg]")
     parser.add_argument("--snr-db", type=float, default=20.0, help="at the elements")
     parser.add_argument("--points", type=int, default=192, help="frequencies that are sounded")
+    parser.add_argument("--loading", type=float, default=1e-2, help="of Capon, relative")
     parser.add_argument("--rounds", type=int, default=1, help="looks at the pictures after the first")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="write the figures to this file")

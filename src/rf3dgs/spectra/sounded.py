@@ -6,8 +6,9 @@ from rf3dgs.channel.sounding import Sounding
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import DirectionGrid
 from rf3dgs.core.progress import Progress, Silent
-from rf3dgs.spectra.config import Loading
+from rf3dgs.spectra.config import AVERAGINGS, Averaging, Loading
 from rf3dgs.spectra.covariance import covariance_of_snapshots
+from rf3dgs.spectra.decorrelation import forward_backward
 from rf3dgs.spectra.loading import loading_power
 from rf3dgs.spectra.scan import ALIASES, array_instrument, beamform
 from rf3dgs.spectra.spectrum import Spectrum
@@ -20,6 +21,7 @@ def spectrum_of_sounding(
     grid: DirectionGrid,
     *,
     method: str = "bartlett",
+    averaging: Averaging = "forward",
     loading: Loading | None = None,
     progress: Progress | None = None,
 ) -> Spectrum:
@@ -34,6 +36,8 @@ def spectrum_of_sounding(
         raise InputError("one element tells no direction; sound with an array_rx, such as planar_array(8, 8)")
     if name not in INVERTED:
         raise InputError(f"method must be one of {', '.join((*INVERTED, *ALIASES))}; got {method!r}")
+    if averaging not in AVERAGINGS:
+        raise InputError(f"averaging must be one of {', '.join(AVERAGINGS)}; got {averaging!r}")
     loading = Loading() if loading is None else loading
     progress = Silent() if progress is None else progress
     batch, rows = sounding.response.shape[:-3], sounding.flat()
@@ -43,6 +47,7 @@ def spectrum_of_sounding(
     progress.start(f"{name} spectra", len(rows.rx))
     for index, response in enumerate(rows.response):
         R = covariance_of_snapshots(response.flatten(-2))
+        R = forward_backward(R) if averaging == "forward-backward" else R
         power[index] = (beamform(name, R, steering, array, loading=loading) / array.peak_gain).float()
         noise[index] += loading_power(R, loading) if name == "capon" else 0.0
         progress.update(index + 1)

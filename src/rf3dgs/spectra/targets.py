@@ -21,7 +21,9 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid
 from rf3dgs.core.progress import Progress, Silent
+from rf3dgs.spectra.config import Loading
 from rf3dgs.spectra.inversion import Panel, fitted, lags_of
+from rf3dgs.spectra.loading import loaded
 from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
 from rf3dgs.spectra.steering import PlanarSteering, lag_sums
 from rf3dgs.spectra.synthesis import ideal_spectrum
@@ -33,6 +35,7 @@ SEARCH = math.radians(1.5)  # between directions in which peaks are looked for
 RING = 0.75  # lobes round a peak, over whose median it stands by
 STANDS_OUT = 2.0  # this factor
 MOST_POINTS = 12
+TOLD = 0.1  # of the noise, where its mean is known: what a picture of many frequencies tells from it
 QUIET = 0.05  # of the least level: the noise to begin with where it is not known
 
 
@@ -122,8 +125,10 @@ def _target(pictures: Spectrum, grid: DirectionGrid, lobe: float | None, start: 
     power, noise = fitted(panels, start.power.double(), _noise(pictures), steps, known=pictures.noise is not None)
     points = Waves(start.directions[len(smooth) :], power[len(smooth) :])
     spectrum = ideal_spectrum(_paths(points, pictures, Pose(pictures.pose.position[:1])), grid, lobe=lobe)
-    shown = (power[: len(smooth)] / area * spectrum.instrument.beam_solid_angle).reshape(grid.shape).float()
-    floor = _floor(panels, noise, len(smooth))
+    beam = spectrum.instrument.beam_solid_angle
+    shown = (power[: len(smooth)] / area * beam).reshape(grid.shape).float()
+    least = noise if pictures.noise is None else TOLD * noise
+    floor = _floor(panels, least, len(smooth), beam / pictures.instrument.beam_solid_angle)
     looked = torch.isfinite(floor).reshape(grid.shape)
     shown = torch.where(looked, shown + spectrum.power[0], torch.zeros(()))
     floor = floor.reshape(1, *grid.shape).float()
@@ -146,13 +151,14 @@ def _noise(pictures: Spectrum) -> Tensor:
     return least * array.peak_gain * array.count * QUIET
 
 
-def _floor(panels: Sequence[Panel], noise: Tensor, count: int) -> Tensor:
-    """Power `[count]` of a wave that an array gathers as strongly as the noise; infinite where none looks."""
+def _floor(panels: Sequence[Panel], least: Tensor, count: int, share: float) -> Tensor:
+    """Power `[count]` in a lobe, a `share` of the array's beam, of a surface that the array gathers as strongly as the
+    noise; infinite where none looks."""
     floor = torch.full((count,), torch.inf, dtype=torch.float64)
-    for panel, one in zip(panels, noise, strict=True):
+    for panel, one in zip(panels, least, strict=True):
         mine = (panel.heard < count) & (panel.weight > 0) & (panel.gain > DEAF * panel.array.peak_gain)
-        least = one / (panel.array.count * panel.gain[mine])
-        floor[panel.heard[mine]] = torch.minimum(floor[panel.heard[mine]], least)
+        own = min(share, 1.0) * one / (panel.array.count * panel.gain[mine])
+        floor[panel.heard[mine]] = torch.minimum(floor[panel.heard[mine]], own)
     return floor
 
 
@@ -168,8 +174,8 @@ def _points(pictures: Spectrum, sums: Sequence[Tensor], smooth: Waves, area: Ten
         panels = _panels(pictures, sums, smooth.directions, area)
         noise = _noise(pictures)
         power, noise = fitted(panels, smooth.power, noise, SHARP_STEPS, known=pictures.noise is not None)
-        inverse = [torch.linalg.inv(one.covariance(power, n)) for one, n in zip(panels, noise, strict=True)]
-        sums = [lag_sums(one, array) for one in inverse]
+        rows = [one.covariance(power, n) for one, n in zip(panels, noise, strict=True)]
+        sums = [lag_sums(torch.linalg.inv(loaded(one, Loading())), array) for one in rows]
     found, power = [torch.zeros(0, 3)], [torch.zeros(0, dtype=torch.float64)]
     for number, one in enumerate(sums):
         direction, strength = _sharp_peaks(pictures[number], one, array)

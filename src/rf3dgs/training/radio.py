@@ -167,6 +167,8 @@ def check_spectra(spectra: Spectrum, numbers: Tensor | None = None) -> None:
 
 def _looked_through(spectra: Spectrum, config: RadioConfig, progress: Progress) -> tuple[Spectrum | None, Spectrum]:
     """The pictures of an array, None for others, and the spectra to learn from."""
+    if spectra.floor is not None:  # what stands where nobody looked must not matter
+        spectra = replace(spectra, power=torch.where(spectra.looked, spectra.power, torch.zeros(())))
     if spectra.instrument.array is None:
         return None, spectra
     if config.array_pictures == "face value":

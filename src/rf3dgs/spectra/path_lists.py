@@ -25,8 +25,8 @@ def path_targets(
     Receivers within a millimetre are one place; a path counts at the one that faces it best, since its neighbours hear
     the same wave. `grid`: whole spheres, 120x60 unless given. A direction without a path is not dark: `floor` is the
     power of a path there that would be heard as strongly as the weakest one that its receiver found, infinite where
-    none looks. Departures are there where the transmitting array tells them. InputError where paths and sounding
-    differ.
+    none looks or where it found nothing. Departures are there where the transmitting array tells them. InputError where
+    paths and sounding differ.
     """
     array = sounding.array_rx
     if array is None:
@@ -45,7 +45,7 @@ def path_targets(
         own = torch.arange(len(group))[:, None]
         mine = here.valid & (facing.argmax(-1) == own)
         heard = here.path_gain * power_pattern(array.pattern, torch.stack([_local(here, i) for i in range(len(group))]))
-        weakest = torch.where(here.valid, heard, torch.inf).amin(-1)
+        weakest = torch.where(here.valid & (heard > 0), heard, torch.inf).amin(-1)
         floor = torch.full(grid.shape, torch.inf)
         for number in range(len(group)):
             local = here.rx[number].to_device(grid.directions)
