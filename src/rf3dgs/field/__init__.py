@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rf3dgs.field.sources import PointSources as PointSources
     from rf3dgs.field.transmitter import estimate_transmitter as estimate_transmitter
     from rf3dgs.field.uncertainty import Uncertainty as Uncertainty
+    from rf3dgs.field.waves import seen_by_array as seen_by_array
 
 _HOMES = {
     "RadioField": ".radio_field",
@@ -22,6 +23,7 @@ _HOMES = {
     "Rays": ".rays",
     "Uncertainty": ".uncertainty",
     "estimate_transmitter": ".transmitter",
+    "seen_by_array": ".waves",
     "GatewayField": ".gateway",
 }
 __all__ = [  # noqa: RUF022 (reading order)
@@ -32,6 +34,7 @@ __all__ = [  # noqa: RUF022 (reading order)
     "Rays",
     "Uncertainty",
     "estimate_transmitter",
+    "seen_by_array",
     "GatewayField",
 ]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

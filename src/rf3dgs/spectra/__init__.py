@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from rf3dgs.spectra.decorrelation import smoothed as smoothed
     from rf3dgs.spectra.loading import loaded as loaded
     from rf3dgs.spectra.order import source_count as source_count
+    from rf3dgs.spectra.path_lists import path_targets as path_targets
     from rf3dgs.spectra.peaks import find_peaks as find_peaks
     from rf3dgs.spectra.peaks import main_peak as main_peak
     from rf3dgs.spectra.resampling import resample as resample
@@ -35,16 +36,19 @@ if TYPE_CHECKING:
     from rf3dgs.spectra.sage import estimate_paths as estimate_paths
     from rf3dgs.spectra.scan import array_instrument as array_instrument
     from rf3dgs.spectra.scan import spectrum_of as spectrum_of
+    from rf3dgs.spectra.sounded import spectrum_of_sounding as spectrum_of_sounding
     from rf3dgs.spectra.spectrum import Instrument as Instrument
     from rf3dgs.spectra.spectrum import Spectrum as Spectrum
     from rf3dgs.spectra.steering import PlanarSteering as PlanarSteering
     from rf3dgs.spectra.synthesis import default_lobe as default_lobe
+    from rf3dgs.spectra.targets import ideal_targets as ideal_targets
     from rf3dgs.spectra.yaws import at_yaws as at_yaws
 
 _HOMES = {
     "Spectrum": ".spectrum",
     "Instrument": ".spectrum",
     "spectrum_of": ".scan",
+    "spectrum_of_sounding": ".sounded",
     "ArrayProcessing": ".config",
     "Loading": ".config",
     "at_yaws": ".yaws",
@@ -72,6 +76,8 @@ _HOMES = {
     "find_peaks": ".peaks",
     "main_peak": ".peaks",
     "resample": ".resampling",
+    "ideal_targets": ".targets",
+    "path_targets": ".path_lists",
     "sage": ".sage",
     "estimate_paths": ".sage",
     "Estimate": ".sage",
@@ -82,6 +88,7 @@ __all__ = [  # noqa: RUF022 (reading order)
     "Spectrum",
     "Instrument",
     "spectrum_of",
+    "spectrum_of_sounding",
     "ArrayProcessing",
     "Loading",
     "at_yaws",
@@ -109,6 +116,8 @@ __all__ = [  # noqa: RUF022 (reading order)
     "find_peaks",
     "main_peak",
     "resample",
+    "ideal_targets",
+    "path_targets",
     "sage",
     "estimate_paths",
     "Estimate",

@@ -12,9 +12,12 @@ def loaded(R: Tensor, loading: Loading) -> Tensor:
     "relative" adds its amount times the mean element power, "absolute" the amount itself, "snr" the mean power times
     10^(-amount / 10).
     """
+    return R + loading_power(R, loading)[..., None, None] * torch.eye(R.shape[-1], dtype=R.dtype)
+
+
+def loading_power(R: Tensor, loading: Loading) -> Tensor:
+    """What `loaded` adds to the diagonal of R `[*batch, element, element]`, `[*batch]`, in the unit of R."""
     mean = R.diagonal(dim1=-2, dim2=-1).real.mean(-1)
     if loading.rule == "absolute":
-        power = torch.full_like(mean, loading.amount)
-    else:
-        power = mean * (loading.amount if loading.rule == "relative" else 10.0 ** (-loading.amount / 10.0))
-    return R + power[..., None, None] * torch.eye(R.shape[-1], dtype=R.dtype)
+        return torch.full_like(mean, loading.amount)
+    return mean * (loading.amount if loading.rule == "relative" else 10.0 ** (-loading.amount / 10.0))

@@ -11,10 +11,13 @@ from rf3dgs.spectra.spectrum import Spectrum
 def resample(spectrum: Spectrum, grid: DirectionGrid) -> Spectrum:
     """The spectrum as seen on `grid` from the same poses: power bilinear, delay and aod weighted by power.
 
+    The floor is that of the nearest pixel.
+
     Directions outside a pinhole's picture have power zero. The lobe should be wider than the pixels of both grids.
     """
     if spectrum.grid.same_as(grid):
         return replace(spectrum, grid=grid)
+    floor = None if spectrum.floor is None else _nearest(spectrum.floor, spectrum.grid, grid)
     batch = spectrum.power.shape[:-2]
     power = spectrum.power.reshape(-1, *spectrum.grid.shape)
     delay = None if spectrum.delay is None else spectrum.delay.reshape(-1, *spectrum.grid.shape)
@@ -45,4 +48,12 @@ def resample(spectrum: Spectrum, grid: DirectionGrid) -> Spectrum:
         power=gathered(powers),
         delay=gathered(delays) if delays else None,
         aod=gathered(aods, 3) if aods else None,
+        floor=floor,
     )
+
+
+def _nearest(floor: torch.Tensor, old: DirectionGrid, grid: DirectionGrid) -> torch.Tensor:
+    """The floor of the nearest pixels of the `old` grid; infinite outside it."""
+    pixel, inside = old.pixel_of(grid.directions)
+    col, row = (pixel[..., axis].long().clamp(0, old.shape[1 - axis] - 1) for axis in (0, 1))
+    return torch.where(inside, floor[..., row, col], torch.inf)

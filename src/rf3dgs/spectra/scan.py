@@ -18,6 +18,7 @@ from rf3dgs.spectra.beamformers import bartlett, capon, hann_taper, music, taper
 from rf3dgs.spectra.config import ArrayProcessing, Loading, Method
 from rf3dgs.spectra.covariance import covariance_of, tap_count
 from rf3dgs.spectra.decorrelation import forward_backward, smoothed
+from rf3dgs.spectra.loading import loading_power
 from rf3dgs.spectra.order import source_count
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.spectra.steering import PlanarSteering, Steering
@@ -68,13 +69,14 @@ def spectrum_of(
     seen = array if how.subarray is None else smoothed(torch.zeros(array.count, array.count), array, *how.subarray)[1]
     steering = PlanarSteering(seen, grid.directions)
     unit = 1.0 if name == "music" else array.peak_gain
-    power = torch.empty(len(rows.rx), *grid.shape)
+    power, noise = torch.empty(len(rows.rx), *grid.shape), torch.empty(len(rows.rx), dtype=torch.float64)
     reporter = Silent() if progress is None else progress
     reporter.start(f"{name} spectra", len(rows.rx))
     for index in range(len(rows.rx)):
         R = _averaged_covariance(rows[index], array, how, seed + index)
         sources = _sources(R, how) if name == "music" else None
         power[index] = (beamform(name, R, steering, seen, loading=how.loading, sources=sources) / unit).float()
+        noise[index] = _noise(R, name, how) / unit
         reporter.update(index + 1)
     reporter.finish()
     return Spectrum(
@@ -85,6 +87,7 @@ def spectrum_of(
         instrument=array_instrument(seen, name),
         method=name,
         tx=paths.tx,
+        noise=None if name == "music" else noise.reshape(batch),
     )
 
 
@@ -112,6 +115,13 @@ def _averaged_covariance(paths: Paths, array: PlanarArray, how: ArrayProcessing,
     if how.subarray is not None:
         R, _ = smoothed(R, array, *how.subarray)
     return forward_backward(R) if how.averaging == "forward-backward" else R
+
+
+def _noise(R: Tensor, name: str, how: ArrayProcessing) -> float:
+    """Mean noise power in an element of R `[element, element]`, with what Capon loads."""
+    mean = float(R.diagonal().real.mean())
+    noise = 0.0 if how.snr_db is None else mean / (1.0 + 10.0 ** (how.snr_db / 10.0))
+    return noise + float(loading_power(R, how.loading)) if name == "capon" else noise
 
 
 def _sources(R: Tensor, how: ArrayProcessing) -> int:
@@ -145,10 +155,11 @@ def beamform(
 
 
 @lru_cache(maxsize=16)
-def array_instrument(array: PlanarArray, method: str) -> Instrument:
+def array_instrument(array: PlanarArray, method: str, *, fov: float = math.pi) -> Instrument:
     """The instrument of an array: half-power width in azimuth and solid angle of its beam at boresight.
 
-    Capon and MUSIC adapt their beams to the signals; they are given the Bartlett beam's figures.
+    Capon and MUSIC adapt their beams to the signals; they are given the Bartlett beam's figures. `fov` [rad]: vertical
+    field of view of the elements, see `Sounder`.
     """
     taper = hann_taper(array) if method == "tapered" else torch.ones(array.count, dtype=torch.float64)
     weights = (taper / taper.sum() / math.sqrt(array.peak_gain)).to(torch.complex64)
@@ -158,4 +169,4 @@ def array_instrument(array: PlanarArray, method: str) -> Instrument:
     cut = torch.stack((torch.cos(angle), torch.sin(angle), torch.zeros_like(angle)), -1)
     below = torch.nonzero((manifold(array, cut) @ weights).abs().square() < 0.5)
     half = float(angle[below[0, 0]]) if len(below) else math.pi / 2
-    return Instrument(f"{array.label} {method}", 2 * half, float((beam * sphere.solid_angle).sum()))
+    return Instrument(f"{array.label} {method}", 2 * half, float((beam * sphere.solid_angle).sum()), array, fov)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from rf3dgs.channel.arrays import PlanarArray
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid
@@ -19,11 +20,15 @@ class Instrument:
 
     name: for people, such as "ideal lobe 3.0 deg" or "8x8 patch capon". lobe: half-power width of the beam [rad].
     beam_solid_angle: integral of the beam's power pattern (1 at its peak) over the sphere [sr].
+    array: what took the pictures, or None for an ideal lobe and where it is not known. fov: vertical field of view of
+    its elements [rad], the full angle about the device's horizon; pi is no limit.
     """
 
     name: str
     lobe: float
     beam_solid_angle: float
+    array: PlanarArray | None = None
+    fov: float = math.pi
 
     @classmethod
     def gaussian(cls, lobe: float) -> "Instrument":
@@ -43,6 +48,10 @@ class Spectrum:
     `[*batch, row, col, 3]` (unit vectors, world frame) are power-weighted means per direction; ideal spectra and fields
     have them, array pictures do not. Where power is zero no path arrives and delay and aod mean nothing.
     `tx` is the transmitter's pose when known; `method` one of "ideal", "bartlett", "tapered", "capon", "field", ...
+
+    `floor` `[*batch, row, col]`: power up to it, zero too, says no more than "at most that"; infinite where the
+    instrument does not look. None: every power is meant. `noise` `[*batch]`, of array pictures: mean power of the noise
+    in an element over its peak gain, Capon's loading included; None where not known.
     """
 
     power: Tensor
@@ -54,6 +63,8 @@ class Spectrum:
     delay: Tensor | None = None
     aod: Tensor | None = None
     tx: Pose | None = None
+    floor: Tensor | None = None
+    noise: Tensor | None = None
 
     def __post_init__(self) -> None:
         expected = (*self.pose.batch_shape, *self.grid.shape)
@@ -63,6 +74,24 @@ class Spectrum:
             raise InputError(f"delay must be {list(self.power.shape)} [s]; got {list(self.delay.shape)}")
         if self.aod is not None and self.aod.shape != (*self.power.shape, 3):
             raise InputError(f"aod must be {[*self.power.shape, 3]}; got {list(self.aod.shape)}")
+        if self.floor is not None and self.floor.shape != self.power.shape:
+            raise InputError(f"floor must be {list(self.power.shape)}, a power for each; got {list(self.floor.shape)}")
+        if self.noise is not None and tuple(self.noise.shape) != self.pose.batch_shape:
+            raise InputError(
+                f"noise must be {list(self.pose.batch_shape)}, one power a pose; got {list(self.noise.shape)}"
+            )
+
+    @property
+    def looked(self) -> Tensor:
+        """True `[*batch, row, col]` where the instrument looks, whatever it finds there."""
+        return torch.ones_like(self.power, dtype=torch.bool) if self.floor is None else torch.isfinite(self.floor)
+
+    @property
+    def heard(self) -> Tensor:
+        """The power `[*batch, row, col]`, at least the floor; zero where the instrument does not look."""
+        if self.floor is None:
+            return self.power
+        return torch.where(self.looked, torch.maximum(self.power, self.floor), torch.zeros_like(self.power))
 
     @property
     def gain_db(self) -> Tensor:
@@ -89,6 +118,8 @@ class Spectrum:
             pose=self.pose[index],
             delay=None if self.delay is None else self.delay[index],
             aod=None if self.aod is None else self.aod[index],
+            floor=None if self.floor is None else self.floor[index],
+            noise=None if self.noise is None else self.noise[index],
         )
 
     def __len__(self) -> int:
@@ -116,4 +147,7 @@ def stack_spectra(spectra: Sequence[Spectrum]) -> Spectrum:
     )
     delay = joined([spectrum.delay for spectrum in spectra], *shape)
     aod = joined([spectrum.aod for spectrum in spectra], *shape, 3)
-    return replace(first, power=power, pose=pose, delay=delay, aod=aod)
+    floor, noise = joined([one.floor for one in spectra], *shape), joined([one.noise for one in spectra])
+    if floor is None and any(spectrum.floor is not None for spectrum in spectra):
+        raise InputError("some of the spectra have a floor and others none; give all of them one, or none")
+    return replace(first, power=power, pose=pose, delay=delay, aod=aod, floor=floor, noise=noise)

@@ -38,8 +38,11 @@ class PlanarSteering:
 
     def forms(self, Q: Tensor) -> Tensor:
         """v^H Q v `[n]`, float64, of a Hermitian Q `[element, element]` over the flattened directions."""
+        return self.of_sums(lag_sums(Q, self.array))
+
+    def of_sums(self, sums: Tensor) -> Tensor:
+        """The same `[n]` of a Hermitian matrix whose `lag_sums` are `sums`."""
         array = self.array
-        sums = lag_sums(Q, array)
         directions = self.directions.reshape(-1, 3)
         result = torch.empty(len(directions), dtype=torch.float64)
         for first in range(0, len(directions), AT_ONCE):

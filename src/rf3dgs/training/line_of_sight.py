@@ -21,17 +21,18 @@ def standing_out(one: Spectrum, direction: Tensor) -> tuple[float, float]:
     """Power of a beam along `direction` `[3]` (world) in a spectrum `[row, col]`, and the level around it, linear.
 
     The level is the median of the ring of 2 to 4 lobes; the beam's power is what stands over it within half a lobe, by
-    least squares, and may be negative. Both are NaN where the grid does not look there.
+    least squares, and may be negative. Both are NaN where the instrument does not look there.
     """
     lobe = one.instrument.lobe
     angle = angle_between(one.directions, direction.expand_as(one.directions))
+    angle, heard = torch.where(one.looked, angle, torch.inf), one.heard
     near = angle < max(0.5 * lobe, 0.75 * pixel_of(one))
     ring = (angle > 2 * lobe) & (angle < 4 * lobe)
     if not bool(near.any()) or not bool(ring.any()):
         return float("nan"), float("nan")
-    level = one.power[ring].double().median()
+    level = heard[ring].double().median()
     kernel = one.instrument.kernel(angle[near]).double()
-    power = (kernel * (one.power[near].double() - level)).sum() / (kernel * kernel).sum()
+    power = (kernel * (heard[near].double() - level)).sum() / (kernel * kernel).sum()
     return float(power), float(level)
 
 

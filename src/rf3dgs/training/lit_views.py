@@ -32,12 +32,19 @@ class LitView:
 
     view: what it shows. keep `[row, col]`: solid angle of the pixel relative to the picture's mean, zero where point
     sources bring more than 30 % of the power or there is none. channels `[row, col, 1 (+ 4)]`: the rest of the power,
-    linear, and that times delay [ns] and departure where the spectra have them.
+    linear, and that times delay [ns] and departure where the spectra have them. floor `[row, col]`: power up to which
+    it says no more than "at most that"; zero where the spectra have none.
     """
 
     view: View
     keep: Tensor
     channels: Tensor
+    floor: Tensor
+
+    @property
+    def certain(self) -> Tensor:
+        """`keep` of the pixels whose power is more than "at most the floor"."""
+        return self.keep * (self.channels[..., 0] > self.floor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +99,9 @@ def _view(one: Spectrum, rays: Rays | None) -> LitView:
         taken = (share[:, None] * known[ray])[:, : channels.shape[-1]].double()
         flat = channels.reshape(-1, channels.shape[-1]).index_add(0, place, -taken)
         channels = flat.reshape(channels.shape)
-    return LitView(view_of(one.pose, one.grid), keep * (channels[..., 0] > 0), channels)
+    floor = torch.zeros_like(one.power) if one.floor is None else torch.where(one.looked, one.floor, torch.zeros(()))
+    told = one.looked & ((channels[..., 0] > 0) | (floor > 0))
+    return LitView(view_of(one.pose, one.grid), keep * told, channels, floor)
 
 
 def observe(geometry: Gaussians, views: Sequence[LitView], *, unit: float, backend: Backend = "auto") -> Observations:
@@ -107,7 +116,7 @@ def observe(geometry: Gaussians, views: Sequence[LitView], *, unit: float, backe
         with torch.enable_grad():
             raster = rasterize(*shape, values, one.view, compositing=BLENDING, backend=backend)
             target = (one.channels[..., : columns - 1] / unit).float()
-            target = torch.cat((torch.ones_like(target[..., :1]), target), -1) * one.keep[..., None]
+            target = torch.cat((torch.ones_like(target[..., :1]), target), -1) * one.certain[..., None]
             (sums,) = torch.autograd.grad(raster.values, values, target)
         chosen = ((sums[:, 0] > LEAST_WEIGHT) & (sums[:, 1] > 0)).nonzero().squeeze(-1)
         rows.append((chosen, torch.full_like(chosen, number), sums[chosen]))
@@ -126,7 +135,8 @@ def observe(geometry: Gaussians, views: Sequence[LitView], *, unit: float, backe
 def shortfall(surface: LitSurface, views: Sequence[LitView], floor_db: float, backend: Backend = "auto") -> Shortfall:
     """What `surface` lacks in `views`, thrown back onto the Gaussians by their share in each pixel's power.
 
-    The share is the derivative of a pixel's level in a Gaussian's. Levels under `floor_db` count as that.
+    The share is the derivative of a pixel's level in a Gaussian's. Levels under `floor_db`, or a pixel's own floor,
+    count as that.
     """
     shape = (surface.means, surface.quats, surface.scales, surface.opacities)
     rows = []
@@ -138,9 +148,9 @@ def shortfall(surface: LitSurface, views: Sequence[LitView], floor_db: float, ba
             raster = rasterize(*shape, values, one.view, compositing=BLENDING, backend=backend)
             shown = raster.values.detach()[..., 0]
             there = one.keep * (shown > 0)
-            floor = 10 ** (floor_db / 10) / surface.unit
-            truth = (one.channels[..., 0] / surface.unit).float().clamp_min(floor)
-            error = 10 * torch.log10(truth / shown.clamp_min(floor))
+            floor = (one.floor / surface.unit).clamp_min(10 ** (floor_db / 10) / surface.unit)
+            truth = torch.maximum((one.channels[..., 0] / surface.unit).float(), floor)
+            error = 10 * torch.log10(truth / torch.maximum(shown, floor))
             share = there / torch.where(shown > 0, shown, 1.0)
             upstream = torch.stack((share, share * error.clamp(-FARTHEST_DB, FARTHEST_DB)), -1)
             (sums,) = torch.autograd.grad(raster.values, values, upstream)

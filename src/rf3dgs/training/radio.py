@@ -5,7 +5,7 @@ field's one dB window; delay and departure follow their own weighted L1 through 
 sight is a point source, fitted in closed form before the surface is trained on what remains.
 """
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import equirect_grid
 from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.field.radiance import Surface
 from rf3dgs.field.radio_field import RadioField
@@ -20,10 +21,12 @@ from rf3dgs.field.transmitter import estimate_transmitter
 from rf3dgs.geometry import find_surfaces
 from rf3dgs.spectra.codec import DbWindow, PaperEncoding, window_of
 from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.spectra.targets import ideal_targets
 from rf3dgs.splats.detail import level_of_detail
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import C0
 from rf3dgs.splats.obstacles import Obstacles
+from rf3dgs.training.array_targets import explained_by
 from rf3dgs.training.checkpoint import fingerprint
 from rf3dgs.training.config import RadioConfig, SourceConfig
 from rf3dgs.training.loop import train
@@ -47,7 +50,9 @@ def fit_radio(
     """Train a field on `spectra` `[position, row, col]` over frozen `geometry`.
 
     `tx` is the transmitter's pose; None takes that of the spectra, or estimates its position from the strongest
-    bearings. More Gaussians than the spectra can tell apart are merged first, as `config.detail` says. With a
+    bearings. Pictures of an array, whose instrument names it, become ideal spectra first (see `ideal_targets`); the
+    mirror model then explains them anew by what it predicts, `config.array_rounds` times. The field renders the ideal
+    lobe. More Gaussians than the spectra can tell apart are merged first, as `config.detail` says. With a
     `checkpoint_dir` a killed run goes on where it stopped and ends with the same bits. Raises InputError for spectra
     that are empty, constant or not finite, and TrainingError when training cannot go on.
     """
@@ -63,6 +68,7 @@ def fit_radio(
         raise InputError('uncertainty belongs to the mirror model; choose model="mirror" or leave it out')
     geometry.check()
     check_spectra(spectra)
+    pictures, spectra = _looked_through(spectra, config, progress)
     given, geometry = len(geometry), _detail(geometry, spectra, config)
     where = spectra.tx if tx is None else tx
     estimated = where is None
@@ -77,6 +83,10 @@ def fit_radio(
     }
     if config.model == "mirror":
         field = fit_mirror(geometry, spectra, config, where, window, _colour(geometry), meta, progress)
+        for _ in range(config.array_rounds if pictures is not None else 0):
+            assert pictures is not None
+            spectra = explained_by(field, pictures, spectra, progress)
+            field = fit_mirror(geometry, spectra, config, where, window, _colour(geometry), meta, progress)
         return _with_uncertainty(field, spectra, progress) if config.uncertainty else field
     found = None
     if config.line_of_sight == "source":
@@ -157,6 +167,17 @@ def check_spectra(spectra: Spectrum, numbers: Tensor | None = None) -> None:
             first = int(wrong.nonzero()[0])
             number = first if numbers is None else int(numbers[first])
             raise InputError(f"the spectrum of position {number} {text}; remove or repair it")
+
+
+def _looked_through(spectra: Spectrum, config: RadioConfig, progress: Progress) -> tuple[Spectrum | None, Spectrum]:
+    """The pictures of an array, None for others, and the spectra to learn from."""
+    if spectra.floor is not None:  # what stands where nobody looked must not matter
+        spectra = replace(spectra, power=torch.where(spectra.looked, spectra.power, torch.zeros(())))
+    if spectra.instrument.array is None:
+        return None, spectra
+    if config.array_pictures == "face value":
+        return None, replace(spectra, instrument=replace(spectra.instrument, array=None))
+    return spectra, ideal_targets(spectra, equirect_grid(*config.array_grid), progress=progress)
 
 
 def _with_uncertainty(field: RadioField, spectra: Spectrum, progress: Progress) -> RadioField:

@@ -57,7 +57,7 @@ def ruled(one: Spectrum, rays: Rays) -> tuple[Tensor, Tensor]:
     is 30 % of the spectrum's or more, and a lobe around the line of sight.
     """
     share = rays.picture(one.pose, one.grid, one.instrument).double()
-    rule = share >= MASKED_SHARE * one.power
+    rule = share >= MASKED_SHARE * one.heard
     for arrival in rays.arrival[rays.order == 0]:
         angle = angle_between(one.directions, arrival.expand_as(one.directions))
         rule = rule | (angle <= MASKED_LOBES * one.instrument.lobe)
@@ -87,4 +87,5 @@ def _view(one: Spectrum, window: DbWindow, rays: Rays | None, encoding: PaperEnc
         late = torch.where(reached, delay / torch.where(reached, power, 1.0) * 1e9, 0.0)
         turned = torch.nn.functional.normalize(aod / torch.where(reached, power, 1.0)[..., None], dim=-1, eps=1e-9)
         csi = torch.cat((late[..., None], turned * reached[..., None]), -1).float()
-    return RadioView(view_of(one.pose, one.grid), window.encode(power.clamp_min(0.0).float()), area * whole, csi)
+    keep = area * (whole & one.looked)
+    return RadioView(view_of(one.pose, one.grid), window.encode(power.clamp_min(0.0).float()), keep, csi)

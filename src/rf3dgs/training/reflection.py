@@ -87,11 +87,12 @@ def ray_powers(one: Spectrum, arrival: Tensor) -> tuple[Tensor, Tensor]:
 
     All beams are solved for together, by least squares of relative errors without negative powers, so that the skirt of
     a strong one is not taken for a weak one beside it. The level around is the median of the ring of 2 to 4 lobes, but
-    for pixels beside other beams; NaN where the grid does not look there.
+    for pixels beside other beams; NaN where the instrument does not look there.
     """
     lobe = one.instrument.lobe
-    directions, seen = one.directions.reshape(-1, 3), one.power.reshape(-1).double()
+    directions, seen = one.directions.reshape(-1, 3), one.heard.reshape(-1).double()
     angle = torch.acos((arrival @ directions.mT).clamp(-1, 1))
+    angle = torch.where(one.looked.reshape(-1), angle, torch.inf)
     close = angle < 1.5 * lobe
     taken = close.sum(0)
     rings = []

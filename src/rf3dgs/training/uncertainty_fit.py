@@ -197,8 +197,9 @@ def _errors(
         rays = None if field.sources is None else field.sources.rays(receiver, field.obstacles)
         if rays is not None:
             shown = shown + rays.picture(truth.pose, truth.grid, truth.instrument)
-        floor = 10 ** (floor_db(surface) / 10)
-        error = 10 * torch.log10(truth.power.clamp_min(floor) / shown.clamp_min(floor))
+        floor = torch.full_like(shown, 10 ** (floor_db(surface) / 10))
+        floor = floor if truth.floor is None else torch.maximum(floor, truth.floor)
+        error = 10 * torch.log10(torch.maximum(truth.power, floor) / torch.maximum(shown, floor)).nan_to_num(0.0)
         error = error.clamp(-FARTHEST_DB, FARTHEST_DB)
         area = truth.grid.solid_angle / truth.grid.solid_angle.mean()
         counts = area * ((truth.power > floor) | (shown > floor))

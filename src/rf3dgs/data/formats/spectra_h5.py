@@ -1,9 +1,9 @@
 """Spectra in HDF5: physical values as scaled integers, readable by any HDF5 program.
 
 Every array says in its attributes `scale`, `offset`, `unit` and `missing` how a stored integer becomes a value:
-`integer * scale + offset`, and no value where it equals `missing`. Departures are unit vectors in the octahedral map:
-two components in [-1, 1], stored one after the other (`aod` `[position, 2, row, col]`). Text is fixed-length UTF-8.
-One picture is one chunk, so that one spectrum is read without the others.
+`integer * scale + offset`, and no value where it equals `missing`; a missing `floor` is infinite. Departures are unit
+vectors in the octahedral map: two components in [-1, 1], stored one after the other (`aod` `[position, 2, row, col]`).
+Text is fixed-length UTF-8. One picture is one chunk, so that one spectrum is read without the others.
 """
 
 import shutil
@@ -19,8 +19,9 @@ from torch import Tensor
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.hdf5 import LIBVER, open_audited, read_array, read_attribute, write_text
+from rf3dgs.core.units import db_from_power
 from rf3dgs.data.formats.spectra_codes import MISSING, Precision, Scale, octahedral_of
-from rf3dgs.data.formats.spectra_head import UNITS, read_head, write_head, write_pose
+from rf3dgs.data.formats.spectra_head import UNITS, read_head, write_head, write_noise, write_pose
 from rf3dgs.data.formats.stored import SpectraFile, StoredSpectra, blocks, stamp_of
 from rf3dgs.spectra.spectrum import Spectrum
 
@@ -179,7 +180,7 @@ def _write_group(group: h5py.Group, spectra: Spectrum, how: Precision) -> None:
             if some.any():
                 high[name] = max(high.get(name, -np.inf), float(values[some].max()))
                 low[name] = min(low.get(name, np.inf), float(values[some].min()))
-    steps = {"gain": how.gain_db, "delay": how.delay, "aod": how.aod}
+    steps = {"gain": how.gain_db, "delay": how.delay, "aod": how.aod, "floor": how.gain_db}
     scales = {
         name: Scale.over(low.get(name, 0.0), high.get(name, low.get(name, 0.0)), step) for name, step in steps.items()
     }
@@ -201,6 +202,8 @@ def _physical(spectra: Spectrum, floor_db: float | None) -> dict[str, tuple[np.n
     if spectra.aod is not None:
         components = np.moveaxis(octahedral_of(spectra.aod.double().numpy()), -1, 1)
         values["aod"] = (components, np.repeat(some[:, None], 2, axis=1))
+    if spectra.floor is not None:
+        values["floor"] = (db_from_power(spectra.floor).double().numpy(), torch.isfinite(spectra.floor).numpy())
     for name, (array, known) in values.items():
         if not np.isfinite(array[known]).all():
             raise InputError(f"{name} has NaN or infinite values where power arrives; mask them by zero power")
@@ -214,6 +217,7 @@ class _GroupWriter:
         self.group, self.count, self.scales, self.floor_db = group, count, scales, floor_db
         self.done = 0
         self.pose: list[Pose] = []
+        self.noise: list[Tensor] = []
 
     def append(self, spectra: Spectrum) -> None:
         """The next spectra `[n, row, col]`."""
@@ -226,7 +230,7 @@ class _GroupWriter:
             # Chunks get their place in the file when the dataset is flushed. Left to the moment when Python drops the
             # last reference to it, the same spectra would make files of different bytes.
             dataset.flush()
-        self._count(spectra.pose)
+        self._count(spectra.pose, spectra.noise)
 
     def copy(self, source: h5py.Group) -> None:
         """The next spectra from a group that was written in the same scales; pictures are not decompressed."""
@@ -243,19 +247,22 @@ class _GroupWriter:
                 place = stored.id.get_chunk_info(number).chunk_offset
                 mask, content = stored.id.read_direct_chunk(place)
                 target.id.write_direct_chunk((place[0] + self.done, *place[1:]), content, mask)
-        self._count(head.pose)
+        self._count(head.pose, head.noise)
 
     def finish(self) -> None:
-        """Write the poses; InputError where spectra are missing."""
+        """Write the poses, and the noise where all have one; InputError where spectra are missing."""
         if self.done != self.count:
             raise InputError(f"expected {self.count} spectra; got {self.done}")
         position, orientation = (
             torch.cat([getattr(pose, name) for pose in self.pose]) for name in ("position", "orientation")
         )
         write_pose(self.group, "", Pose(position, orientation))
+        if len(self.noise) == len(self.pose):
+            write_noise(self.group, torch.cat(self.noise))
 
-    def _count(self, pose: Pose) -> None:
+    def _count(self, pose: Pose, noise: Tensor | None) -> None:
         self.pose.append(pose)
+        self.noise.extend([] if noise is None else [noise])
         self.done += len(pose)
 
     def _dataset(self, name: str, shape: tuple[int, ...]) -> h5py.Dataset:

@@ -1,19 +1,23 @@
 """The head of a group of spectra: grid, poses, frequency, instrument, method; every quantity with its unit."""
 
+import math
 from dataclasses import dataclass
 
 import h5py
 import numpy as np
 import torch
+from torch import Tensor
 
-from rf3dgs.core.errors import DataError
+from rf3dgs.channel.arrays import PlanarArray
+from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid, list_grid, pinhole_grid
 from rf3dgs.core.hdf5 import read_array, read_attribute, write_text
 from rf3dgs.data.formats.spectra_codes import MISSING, Scale
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 
-UNITS = {"gain": "dB", "delay": "s", "aod": "octahedral"}
+UNITS = {"gain": "dB", "delay": "s", "aod": "octahedral", "floor": "dB"}
+NOISE = "linear power"
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,16 +31,18 @@ class Head:
     method: str
     tx: Pose | None
     scales: dict[str, Scale]
+    noise: Tensor | None = None
 
 
 def write_head(group: h5py.Group, spectrum: Spectrum | Head) -> None:
-    """Write all of the head but the receivers' poses."""
+    """Write all of the head but the receivers' poses and noise."""
     write_text(group.attrs, "method", spectrum.method)
     write_text(group.attrs, "instrument", spectrum.instrument.name)
     _write_quantity(group, "frequency", spectrum.frequency, "Hz")
     _write_quantity(group, "lobe", spectrum.instrument.lobe, "rad")
     _write_quantity(group, "beam_solid_angle", spectrum.instrument.beam_solid_angle, "sr")
     _write_grid(group, spectrum.grid)
+    _write_array(group, spectrum.instrument)
     if spectrum.tx is not None:
         write_pose(group, "tx_", spectrum.tx)
 
@@ -47,7 +53,10 @@ def read_head(group: h5py.Group) -> Head:
         expect_unit(group, f"{name}_unit", unit)
     scales = {name: _read_scale(group, name) for name in UNITS if name == "gain" or name in group}
     instrument = Instrument(
-        str(read_attribute(group, "instrument")), _number(group, "lobe"), _number(group, "beam_solid_angle")
+        str(read_attribute(group, "instrument")),
+        _number(group, "lobe"),
+        _number(group, "beam_solid_angle"),
+        *_read_array(group),
     )
     head = Head(
         grid=_read_grid(group),
@@ -57,7 +66,10 @@ def read_head(group: h5py.Group) -> Head:
         method=str(read_attribute(group, "method")),
         tx=read_pose(group, "tx_") if "tx_position" in group else None,
         scales=scales,
+        noise=_read_noise(group),
     )
+    if head.noise is not None and tuple(head.noise.shape) != head.pose.batch_shape:
+        raise DataError(f"{group.file.filename}: noise must be {list(head.pose.batch_shape)}, one a spectrum")
     for name in scales:
         between = (2,) if name == "aod" else ()
         expected = (*head.pose.batch_shape, *between, *head.grid.shape)
@@ -82,6 +94,52 @@ def read_pose(group: h5py.Group, prefix: str) -> Pose:
     expect_unit(group[prefix + "position"], "unit", "m")
     expect_unit(group[prefix + "orientation"], "unit", "quaternion wxyz, world_from_device")
     return Pose(torch.from_numpy(position), torch.from_numpy(orientation))
+
+
+def write_noise(group: h5py.Group, noise: Tensor) -> None:
+    """Write the noise `[position]` of array pictures."""
+    dataset = group.create_dataset("noise", data=noise.double().contiguous().numpy(), track_times=False)
+    write_text(dataset.attrs, "unit", NOISE)
+
+
+def _read_noise(group: h5py.Group) -> Tensor | None:
+    if "noise" not in group:
+        return None
+    values = read_array(group, "noise")
+    expect_unit(group["noise"], "unit", NOISE)
+    if not (np.isfinite(values).all() and (values >= 0).all()):
+        raise DataError(f"{group.file.filename}: noise must be finite powers of at least 0; write the file again")
+    return torch.from_numpy(values.astype(np.float64))
+
+
+def _write_array(group: h5py.Group, instrument: Instrument) -> None:
+    """Write the array that took the pictures, where one is known."""
+    array = instrument.array
+    if array is None:
+        return
+    group.attrs["array_rows"], group.attrs["array_cols"] = array.rows, array.cols
+    write_text(group.attrs, "array_pattern", array.pattern)
+    _write_quantity(group, "array_spacing", np.array([array.vertical, array.horizontal]), "wavelength")
+    _write_quantity(group, "array_fov", instrument.fov, "rad")
+
+
+def _read_array(group: h5py.Group) -> tuple[PlanarArray | None, float]:
+    """The array and its elements' vertical field of view [rad]; None and pi where the file names none."""
+    if "array_rows" not in group.attrs:
+        return None, math.pi
+    expect_unit(group, "array_spacing_unit", "wavelength")
+    expect_unit(group, "array_fov_unit", "rad")
+    rows, cols = (int(_number(group, f"array_{name}")) for name in ("rows", "cols"))
+    spacing = np.asarray(read_attribute(group, "array_spacing"), dtype=np.float64).reshape(-1)
+    if spacing.shape != (2,):
+        raise DataError(f"{group.file.filename}: array_spacing must be two numbers; got {spacing.size}")
+    try:
+        array = PlanarArray(
+            rows, cols, str(read_attribute(group, "array_pattern")), float(spacing[0]), float(spacing[1])
+        )
+    except InputError as error:
+        raise DataError(f"{group.file.filename}: the array is not one ({error}); write the file again") from error
+    return array, min(_number(group, "array_fov"), math.pi)
 
 
 def expect_unit(item: h5py.HLObject, key: str, unit: str) -> None:

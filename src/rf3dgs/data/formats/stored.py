@@ -35,7 +35,7 @@ class SpectraFile:
     head: Head
 
     def read(self, names: Sequence[str], index: Tensor) -> dict[str, Tensor]:
-        """Values of the spectra `index` `[n]`: "power" and "delay" `[n, row, col]`, "aod" `[n, row, col, 3]`."""
+        """Values of the spectra `index` `[n]`: "power", "delay", "floor" `[n, row, col]`, "aod" `[n, row, col, 3]`."""
         shape = (len(index), *self.head.grid.shape)
         values = {name: torch.empty(*shape, 3) if name == "aod" else torch.empty(shape) for name in names}
         tables = {name: _table(name, self.head.scales["gain" if name == "power" else name]) for name in names}
@@ -71,8 +71,8 @@ def _table(name: str, scale: Scale) -> np.ndarray:
     if name == "aod":
         return values
     value = torch.from_numpy(values)
-    value = (power_from_db(value) if name == "power" else value).float()
-    value[MISSING] = 0.0
+    value = (power_from_db(value) if name in ("power", "floor") else value).float()
+    value[MISSING] = torch.inf if name == "floor" else 0.0
     return value.numpy()
 
 
@@ -85,9 +85,10 @@ def stamp_of(path: Path) -> tuple[int, int, int]:
 class StoredSpectra(Spectrum):
     """A `Spectrum` `[position, row, col]` in a file: poses and grid are known, values are read when they are needed.
 
-    `spectra[3]` and iteration read one picture; `spectra[2:9]` and `spectra[places]` read nothing yet. `power`, `delay`
-    and `aod` read what they are asked for, once, and keep it, as everything does that works on a whole `Spectrum`
-    (training, evaluation, `dataclasses.replace`). Raises DataError where the file is damaged or was changed since.
+    `spectra[3]` and iteration read one picture; `spectra[2:9]` and `spectra[places]` read nothing yet. `power`,
+    `delay`, `aod` and `floor` read what they are asked for, once, and keep it, as everything does that works on a whole
+    `Spectrum` (training, evaluation, `dataclasses.replace`). Raises DataError where the file is damaged or was changed
+    since.
     """
 
     source: SpectraFile
@@ -104,6 +105,7 @@ class StoredSpectra(Spectrum):
         index = torch.arange(len(head.pose)) if index is None else index
         values = {name: getattr(head, name) for name in ("grid", "frequency", "instrument", "method", "tx")}
         self = object.__new__(cls)
+        values |= {"noise": None if head.noise is None else head.noise[index]}
         for name, value in (values | {"pose": head.pose[index], "source": source, "index": index}).items():
             object.__setattr__(self, name, value)
         return self
@@ -122,6 +124,11 @@ class StoredSpectra(Spectrum):
     def aod(self) -> Tensor | None:  # type: ignore[override]
         """Departures `[position, row, col, 3]`; read when first asked for."""
         return self.source.read(("aod",), self.index)["aod"] if "aod" in self.source.head.scales else None
+
+    @cached_property
+    def floor(self) -> Tensor | None:  # type: ignore[override]
+        """Floor `[position, row, col]`; read when first asked for."""
+        return self.source.read(("floor",), self.index)["floor"] if "floor" in self.source.head.scales else None
 
     @property
     def is_whole(self) -> bool:
@@ -153,7 +160,7 @@ class StoredSpectra(Spectrum):
         return StoredSpectra.of, (self.source, self.index)
 
     def _read(self, number: int) -> Spectrum:
-        names = ["power", *(name for name in ("delay", "aod") if name in self.source.head.scales)]
+        names = ["power", *(name for name in ("delay", "aod", "floor") if name in self.source.head.scales)]
         values = self.source.read(names, self.index[number : number + 1])
         pose: Pose = self.pose[number]
         return Spectrum(
@@ -166,6 +173,8 @@ class StoredSpectra(Spectrum):
             values["delay"][0] if "delay" in values else None,
             values["aod"][0] if "aod" in values else None,
             self.tx,
+            values["floor"][0] if "floor" in values else None,
+            None if self.noise is None else self.noise[number],
         )
 
 
