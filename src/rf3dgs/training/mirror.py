@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.progress import Progress
-from rf3dgs.field.lit import HARMONICS, LitSurface
+from rf3dgs.field.lit import CSI_HARMONICS, HARMONICS, LitSurface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.geometry import Surfaces, find_surfaces
 from rf3dgs.spectra.codec import DbWindow
@@ -105,6 +105,9 @@ def fit_surface(
         cell_sh=torch.zeros(int(cells.max()) + 1, HARMONICS),
         level=torch.zeros(len(geometry)),
         ambient=fit_ambient(scattering, seen, laws),
+        segment_csi=torch.zeros(len(laws), CSI_HARMONICS, 4),
+        cell_csi=torch.zeros(int(cells.max()) + 1, CSI_HARMONICS, 4),
+        own_csi=torch.zeros(len(geometry), 4),
         tx=tx,
         window=window,
     )
