@@ -175,13 +175,9 @@ def _lacking(shown: Tensor, one: LitView, unit: float, floor_db: float) -> Tenso
     reached = share * (truth >= floor)
     known = one.channels / torch.where(truth > 0, one.channels[..., 0], 1.0)[..., None]
     late = known[..., 1].float() - shown[..., 1] / some
-    blended = shown[..., 2:5] / some[..., None]
-    length = torch.linalg.vector_norm(blended, dim=-1, keepdim=True)
-    true_departure = torch.nn.functional.normalize(known[..., 2:].float(), dim=-1, eps=1e-9)
-    turned = length * true_departure - blended
+    turned = torch.nn.functional.normalize(known[..., 2:].float(), dim=-1, eps=1e-9) - shown[..., 2:5] / some[..., None]
     slow = reached * SOFT_NS / late.abs().clamp_min(SOFT_NS)
-    apart = torch.linalg.vector_norm(turned, dim=-1) / length[..., 0].clamp_min(1e-3)
-    bent = reached * SOFT_TURN / apart.clamp_min(SOFT_TURN)
+    bent = reached * SOFT_TURN / torch.linalg.vector_norm(turned, dim=-1).clamp_min(SOFT_TURN)
     return torch.stack((*level, slow, slow * late, bent, *(bent[..., None] * turned).unbind(-1)), -1)
 
 

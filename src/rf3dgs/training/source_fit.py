@@ -11,13 +11,14 @@ from rf3dgs.field.images import HIGHEST_ORDER
 from rf3dgs.field.moving import with_images as images_among
 from rf3dgs.field.rays import Rays
 from rf3dgs.field.sources import PointSources
-from rf3dgs.geometry import Surfaces
+from rf3dgs.geometry import Patches, Planes, Surfaces
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
 from rf3dgs.training.consolidation import consolidated, with_skins
 from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
 from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_marks, fit_reflection, glints, silent_planes
+from rf3dgs.training.timed_mirrors import timed_mirrors, with_timed
 from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, refined_planes, with_mirrors
 
 PROBES = 150
@@ -65,20 +66,19 @@ def fit_sources(
     surfaces = consolidated(surfaces, obstacles.means)
     obstacles = replace(obstacles, labels=surfaces.plane_of)
     sources = _known(direct, surfaces)
+    timed = timed_mirrors(spectra, tx.position) if config.complete else []
+    if timed:
+        sources, surfaces, obstacles = _over(sources, with_timed(sources, timed), surfaces, obstacles)
     sources = with_images(sources, probes, replace(config, order=1))
     peaks = peaks_of(spectra) if config.refine or config.complete else None
     if peaks is not None and config.refine:
         sources = _refined(sources, seen, peaks, positions, obstacles, config)
-    if peaks is not None and config.complete:
+    if peaks is not None and config.complete and not timed:
         every = _fitted(sources, spectra, seen, obstacles)
         every = with_images(every, probes, config)
         mirrors = find_mirrors(every, every.rays_each(positions, obstacles, in_sight=seen), peaks, spectra, obstacles)
         if mirrors:
-            sources = completed(sources, *with_mirrors(sources, mirrors))
-            assert sources.patches is not None
-            surfaces = replace(surfaces, planes=sources.planes, patches=sources.patches)
-            surfaces = replace(surfaces, plane_of=with_skins(surfaces, obstacles.means))
-            obstacles = replace(obstacles, labels=surfaces.plane_of)
+            sources, surfaces, obstacles = _over(sources, with_mirrors(sources, mirrors), surfaces, obstacles)
             sources = with_images(sources, probes, replace(config, order=1))
             sources = _refined(sources, seen, peaks, positions, obstacles, config)
     rays = sources.rays_each(positions, obstacles, in_sight=seen)
@@ -101,6 +101,17 @@ def with_images(
     if silent is not None:
         sources = replace(sources, mirrors=~silent)
     return images_among(sources, probes, order=config.order, planes=config.planes, largest=config.largest)
+
+
+def _over(
+    sources: PointSources, found: tuple[Planes, Patches], surfaces: Surfaces, obstacles: Obstacles
+) -> tuple[PointSources, Surfaces, Obstacles]:
+    """Sources and surfaces over the planes that were found, and obstacles that know which Gaussians belong to them."""
+    planes, patches = found
+    sources = completed(sources, planes, patches)
+    surfaces = replace(surfaces, planes=planes, patches=patches)
+    surfaces = replace(surfaces, plane_of=with_skins(surfaces, obstacles.means))
+    return sources, surfaces, replace(obstacles, labels=surfaces.plane_of)
 
 
 def _known(direct: PointSources, surfaces: Surfaces) -> PointSources:
