@@ -47,7 +47,7 @@ def timed_mirrors(spectra: Spectrum, tx: Tensor) -> list[Mirror]:
         best = int(seen_by.sum(-1).argmax())
         if int(seen_by[best].sum()) < LEAST_POSITIONS:
             break
-        chosen = near[best]
+        chosen, middle = near[best], image[best]
         for _ in range(ROUNDS):
             middle = image[chosen].median(0).values
             chosen = torch.linalg.vector_norm(image - middle, dim=-1) < SAME_IMAGE
