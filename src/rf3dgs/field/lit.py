@@ -19,8 +19,9 @@ that gaps between Gaussians neither leak nor darken. A picture of a surface has 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -34,6 +35,9 @@ from rf3dgs.splats.compositing import Compositing
 from rf3dgs.splats.harmonics import C0, evaluate, view_directions
 from rf3dgs.splats.rasterize import Backend, rasterize
 
+Part = Literal["sources", "lit", "ambient"]
+PARTS: tuple[Part, ...] = ("sources", "lit", "ambient")
+SILENT_DB = -300.0  # of an ambient level that is to be nothing
 HARMONICS = 16
 CSI_DEGREE = 2
 CSI_HARMONICS = (CSI_DEGREE + 1) ** 2
@@ -178,10 +182,16 @@ class LitSurface:
         lobe = (0.5 + 0.5 * cosine).clamp_min(1e-6).pow(self._lobe)
         return self._arriving * lobe, self._ambient_power
 
+    def only(self, part: Part) -> "LitSurface":
+        """The lit or the ambient part, or neither for "sources"; each with the residual, so that they add up."""
+        silent = self.laws.clone()
+        silent[:, 3], silent[:, 4] = SILENT_DB, 0.0
+        dark = torch.zeros_like(self.visibility)
+        laws = self.laws if part == "ambient" else silent
+        return replace(self, laws=laws, visibility=self.visibility if part == "lit" else dark)
+
     def without_residual(self) -> "LitSurface":
         """The laws alone: lit and ambient, E = 0."""
-        from dataclasses import replace
-
         zero = torch.zeros_like
         names = ("segment_sh", "cell_sh", "level", "segment_csi", "cell_csi", "own_csi")
         return replace(self, **{name: zero(getattr(self, name)) for name in names})
