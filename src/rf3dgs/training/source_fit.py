@@ -23,6 +23,8 @@ from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, re
 
 PROBES = 150
 PROBE_MARGIN = 0.5
+GATES = (0.2, 0.3, 0.1, 0.05, 0.5)  # of transmittance a leg; of equally good ones the first
+SIGHT_WEIGHT = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +83,7 @@ def fit_sources(
             sources, surfaces, obstacles = _over(sources, with_mirrors(sources, mirrors), surfaces, obstacles)
             sources = with_images(sources, probes, replace(config, order=1))
             sources = _refined(sources, seen, peaks, positions, obstacles, config)
+    sources = _gated(sources, spectra, seen, obstacles)
     rays = sources.rays_each(positions, obstacles, in_sight=seen)
     found = glints(sources, rays, spectra)
     reflection = fit_reflection(found, len(sources.planes))
@@ -124,6 +127,23 @@ def _fitted(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: O
     """The sources with what each plane reflects."""
     rays = sources.rays_each(spectra.pose.position, obstacles, in_sight=seen)
     return replace(sources, reflection=fit_reflection(glints(sources, rays, spectra), len(sources.planes)))
+
+
+def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Obstacles) -> PointSources:
+    """The sources with the threshold that agrees best with who sees the transmitter, and which reflections shine.
+
+    A reflection says less: where its peak is not seen it may be weak rather than hidden.
+    """
+    ways = [sources.candidates(position, obstacles) for position in spectra.pose.position]
+    looked = glints(sources, [rays for rays, _ in ways], spectra)
+    passed = torch.zeros(len(spectra), len(sources))
+    for place, (rays, share) in enumerate(ways):
+        passed[place, rays.index] = share
+    gates = torch.tensor(GATES)[:, None]
+    wrong = SIGHT_WEIGHT * ((passed[:, 0] > gates) != seen).sum(-1)
+    shone = passed[looked.position, looked.source][looked.alone]
+    wrong = wrong + ((shone > gates) != looked.seen[looked.alone]).sum(-1)
+    return replace(sources, open_above=GATES[int(wrong.argmin())])
 
 
 def _refined(
