@@ -13,9 +13,11 @@ from rf3dgs.core.grids import equirect_grid, list_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.field.io import _digest, load_field
 from rf3dgs.field.lit import LitSurface
+from rf3dgs.field.radiance import Surface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Instrument
+from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.surface import normals, sample_mesh
 
 TX = torch.tensor([1.0, 0.5, 2.0])
@@ -139,6 +141,26 @@ def test_the_residual_of_delay_and_departure_adds_to_both_parts_whatever_their_p
     without = field_of(replace(louder, own_csi=torch.zeros(1, 4))).render(Pose(receiver), list_grid(along[None]))
     assert float(shown.delay - without.delay) == pytest.approx(2e-9, abs=2e-12)
     assert torch.equal(louder.without_residual().own_csi, torch.zeros(1, 4))
+
+
+def test_the_parts_of_a_field_add_up_to_the_whole():
+    whole = field_of(floor(0.3, segment_sh=torch.full((1, 16), 2.0)))
+    here, grid = Pose([-0.5, 0.4, 1.2]), equirect_grid(60, 30)
+    shown = whole.render(here, grid).power
+    parts = [whole.only(part).render(here, grid).power for part in ("sources", "lit", "ambient")]
+    torch.testing.assert_close(torch.stack(parts).sum(0), shown, rtol=1e-5, atol=0.0)
+    assert float(parts[0].max()) < 1e-20 * float(shown.max())
+    assert float(parts[1].max()) > 3 * float(parts[2].max()) > 0
+    with pytest.raises(InputError, match="part must be one of sources, lit, ambient; got 'dark'"):
+        whole.only("dark")
+
+
+def test_a_field_of_the_paper_has_no_parts():
+    bare = facet()
+    opaque = Gaussians(bare.means, bare.quats, bare.log_scales, bare.logit_opacities, torch.zeros(1, 1, 1))
+    paper = replace(field_of(bare), surface=Surface.bare(opaque, tx=TX, window=bare.window))
+    with pytest.raises(InputError, match="parts belong to the mirror model"):
+        paper.only("lit")
 
 
 def test_a_lit_floor_sends_the_analytic_integral():

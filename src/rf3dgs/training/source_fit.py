@@ -132,7 +132,8 @@ def _fitted(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: O
 def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Obstacles) -> PointSources:
     """The sources with the threshold that agrees best with who sees the transmitter, and which reflections shine.
 
-    A reflection says less: where its peak is not seen it may be weak rather than hidden.
+    A way that is open and should not be counts twice: it misleads a beam, where one that is missing only costs its own
+    power. The line of sight counts thrice.
     """
     ways = [sources.candidates(position, obstacles) for position in spectra.pose.position]
     looked = glints(sources, [rays for rays, _ in ways], spectra)
@@ -142,7 +143,8 @@ def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Ob
     gates = torch.tensor(GATES)[:, None]
     wrong = SIGHT_WEIGHT * ((passed[:, 0] > gates) != seen).sum(-1)
     shone = passed[looked.position, looked.source][looked.alone]
-    wrong = wrong + ((shone > gates) != looked.seen[looked.alone]).sum(-1)
+    glints_seen = looked.seen[looked.alone]
+    wrong = wrong + 2 * ((shone > gates) & ~glints_seen).sum(-1) + ((shone <= gates) & glints_seen).sum(-1)
     return replace(sources, open_above=GATES[int(wrong.argmin())])
 
 
