@@ -13,9 +13,11 @@ from rf3dgs.core.grids import equirect_grid, list_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.field.io import _digest, load_field
 from rf3dgs.field.lit import LitSurface
+from rf3dgs.field.radiance import Surface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Instrument
+from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.surface import normals, sample_mesh
 
 TX = torch.tensor([1.0, 0.5, 2.0])
@@ -39,6 +41,9 @@ def facet(laws=LAWS, **changes) -> LitSurface:
         "cell_sh": torch.zeros(1, 16),
         "level": torch.zeros(1),
         "ambient": torch.tensor([[20.0, 0.0, 1.0, 0.0]]),
+        "segment_csi": torch.zeros(1, 9, 4),
+        "cell_csi": torch.zeros(1, 9, 4),
+        "own_csi": torch.zeros(1, 4),
         "tx": TX,
         "window": DbWindow(-140.0, -60.0),
     }
@@ -75,6 +80,7 @@ def floor(spacing: float = 0.04, **changes) -> LitSurface:
         cell_of=torch.zeros(count, dtype=torch.long),
         level=torch.zeros(count),
         ambient=torch.tensor([20.0, 0.0, 1.0, 0.0]).expand(count, 4).contiguous(),
+        own_csi=torch.zeros(count, 4),
         **changes,
     )
 
@@ -116,6 +122,45 @@ def test_residuals_add_decibels_and_end_at_twelve():
     constant[0, 0] = 2.0 / 0.28209479
     both = facet(segment_sh=constant, cell_sh=constant).values(receiver, csi=False)
     assert 10 * math.log10(float(both / plain)) == pytest.approx(4.0, abs=1e-4)
+
+
+def test_the_residual_of_delay_and_departure_adds_to_both_parts_whatever_their_power():
+    receiver = torch.tensor([0.3, 0.2, 1.0])
+    along = -receiver / receiver.norm()
+    segment, cell = torch.zeros(1, 9, 4), torch.zeros(1, 9, 4)
+    segment[0, 2, 0] = 7.0  # the harmonic 0.4886 z, of delay
+    cell[0, 0, 2] = 0.5 / 0.28209479  # a constant, of the departure's y
+    own = torch.tensor([[2.0, 0.0, 0.0, -0.25]])
+    plain = facet().values(receiver)[0]
+    bent = facet(segment_csi=segment, cell_csi=cell, own_csi=own).values(receiver)[0]
+    added = torch.tensor([7.0 * 0.48860251 * float(along[2]) + 2.0, 0.0, 0.5, -0.25])
+    assert float(bent[0]) == float(plain[0])
+    torch.testing.assert_close((bent[1:] - plain[1:]) / plain[0], added, rtol=1e-4, atol=1e-5)
+    louder = facet(level=torch.tensor([5.0]), own_csi=own)
+    shown = field_of(louder).render(Pose(receiver), list_grid(along[None]))
+    without = field_of(replace(louder, own_csi=torch.zeros(1, 4))).render(Pose(receiver), list_grid(along[None]))
+    assert float(shown.delay - without.delay) == pytest.approx(2e-9, abs=2e-12)
+    assert torch.equal(louder.without_residual().own_csi, torch.zeros(1, 4))
+
+
+def test_the_parts_of_a_field_add_up_to_the_whole():
+    whole = field_of(floor(0.3, segment_sh=torch.full((1, 16), 2.0)))
+    here, grid = Pose([-0.5, 0.4, 1.2]), equirect_grid(60, 30)
+    shown = whole.render(here, grid).power
+    parts = [whole.only(part).render(here, grid).power for part in ("sources", "lit", "ambient")]
+    torch.testing.assert_close(torch.stack(parts).sum(0), shown, rtol=1e-5, atol=0.0)
+    assert float(parts[0].max()) < 1e-20 * float(shown.max())
+    assert float(parts[1].max()) > 3 * float(parts[2].max()) > 0
+    with pytest.raises(InputError, match="part must be one of sources, lit, ambient; got 'dark'"):
+        whole.only("dark")
+
+
+def test_a_field_of_the_paper_has_no_parts():
+    bare = facet()
+    opaque = Gaussians(bare.means, bare.quats, bare.log_scales, bare.logit_opacities, torch.zeros(1, 1, 1))
+    paper = replace(field_of(bare), surface=Surface.bare(opaque, tx=TX, window=bare.window))
+    with pytest.raises(InputError, match="parts belong to the mirror model"):
+        paper.only("lit")
 
 
 def test_a_lit_floor_sends_the_analytic_integral():
@@ -186,25 +231,31 @@ def test_gradients_are_those_of_finite_differences():
         "window": DbWindow(-140.0, -60.0),
     }
 
-    def sent(laws, segment_sh, cell_sh, level, ambient):
-        learned = {"laws": laws, "segment_sh": segment_sh, "cell_sh": cell_sh, "level": level, "ambient": ambient}
+    names = ("laws", "segment_sh", "cell_sh", "level", "ambient", "segment_csi", "cell_csi", "own_csi")
+
+    def sent(*values):
+        learned = dict(zip(names, values, strict=True))
         return LitSurface(**double, **learned).values(torch.tensor([0.1, 4.0, 3.0], dtype=torch.float64))
 
     laws = torch.tensor([[-60.0, 0.7, 4.0, -61.0, -1.5], [-62.0, -0.4, 1.0, -63.0, 0.5]], dtype=torch.float64)
     learned = [laws, 0.5 * random(2, 16), 0.5 * random(3, 16), random(5), random(5, 4)]
+    learned += [random(2, 9, 4), random(3, 9, 4), random(5, 4)]
     assert torch.autograd.gradcheck(sent, [tensor.requires_grad_() for tensor in learned])
 
 
 def test_a_lit_field_comes_back_from_disk_and_saving_it_again_changes_nothing(tmp_path):
     generator = torch.Generator().manual_seed(1)
     surface = floor(0.3)
-    surface = replace(surface, level=torch.randn(len(surface), generator=generator))
+    drawn = {name: getattr(surface, name) for name in ("level", "segment_csi", "cell_csi", "own_csi")}
+    drawn = {name: torch.randn(tensor.shape, generator=generator) for name, tensor in drawn.items()}
+    surface = replace(surface, **drawn)
     before = field_of(surface)
     before.save(tmp_path / "one.field")
     after = load_field(tmp_path / "one.field")
     assert isinstance(after.surface, LitSurface)
     torch.testing.assert_close(after.surface.laws, surface.laws, rtol=0, atol=0)
-    torch.testing.assert_close(after.surface.level, surface.level.half().float(), rtol=0, atol=0)
+    for name, tensor in drawn.items():
+        torch.testing.assert_close(getattr(after.surface, name), tensor.half().float(), rtol=0, atol=0)
     here, grid = Pose([-0.5, 0.4, 1.2]), equirect_grid(60, 30)
     first, second = before.render(here, grid), after.render(here, grid)
     lit = first.power > 0
@@ -215,12 +266,30 @@ def test_a_lit_field_comes_back_from_disk_and_saving_it_again_changes_nothing(tm
     assert names[0].read_bytes() == names[1].read_bytes()
 
 
+def rewritten(path, edit) -> None:
+    """The description of a saved field, edited and signed again."""
+    record = json.loads((path / "field.json").read_text())
+    edit(record["body"])
+    record["sha256"] = _digest(record["body"])
+    (path / "field.json").write_text(json.dumps(record))
+
+
+def test_a_file_of_before_delay_and_departure_had_a_residual_loads_without_one(tmp_path):
+    surface = floor(0.3)
+    surface = replace(surface, own_csi=torch.ones(len(surface), 4))
+    field_of(surface).save(tmp_path / "a.field")
+    rewritten(tmp_path / "a.field", lambda body: body.pop("csi_coefficients"))
+    # An older file lacks the tensors as well; what a description does not name is not looked at.
+    assert float(load_field(tmp_path / "a.field").surface.own_csi.abs().max()) == 0.0
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"normals": torch.zeros(2, 3)}, r"normals must be \[1, 3\] for 1 Gaussians, 1 segments and 1 cells"),
         ({"laws": torch.zeros(1, 4)}, r"laws must be \[1, 5\]"),
         ({"segment_of": torch.tensor([1])}, r"segment_of must number 0..0; got 1 to 1"),
+        ({"cell_csi": torch.zeros(1, 4, 4)}, r"cell_csi must be \[1, 9, 4\] for 1 Gaussians, 1 segments and 1 cells"),
         ({"cell_of": torch.tensor([-1])}, r"cell_of must number 0..0; got -1 to -1"),
     ],
 )
@@ -235,14 +304,11 @@ def test_surfaces_that_do_not_fit_together_are_refused(changes, message):
         (lambda body: body.update(model="crystal"), "model must be one of mirror, paper; got 'crystal'"),
         (lambda body: body.update(segments=7), "laws must be"),
         (lambda body: body.pop("cells"), "cells"),
+        (lambda body: body.update(csi_coefficients=4), "csi_coefficients must be 9, or left out .* got 4"),
     ],
 )
 def test_descriptions_that_do_not_fit_the_tensors_are_refused(tmp_path, edit, message):
     field_of(facet()).save(tmp_path / "a.field")
-    path = tmp_path / "a.field" / "field.json"
-    record = json.loads(path.read_text())
-    edit(record["body"])
-    record["sha256"] = _digest(record["body"])
-    path.write_text(json.dumps(record))
+    rewritten(tmp_path / "a.field", edit)
     with pytest.raises(DataError, match=message):
         load_field(tmp_path / "a.field")

@@ -81,6 +81,9 @@ def room(*, screen: bool = False) -> RadioField:
         cell_sh=torch.randn(1, 16, generator=generator),
         level=torch.randn(count, generator=generator),
         ambient=bounce(shell.means, HERE.position),
+        segment_csi=torch.randn(6, 9, 4, generator=generator),
+        cell_csi=torch.randn(1, 9, 4, generator=generator),
+        own_csi=torch.randn(count, 4, generator=generator),
         tx=HERE.position,
         window=DbWindow(-140.0, -60.0),
     )

@@ -24,6 +24,7 @@ from rf3dgs.training.consolidation import surface_points
 from rf3dgs.training.radio_views import ruled
 from rf3dgs.training.reflection import fit_marks, fit_reflection, glints, silent_planes
 from rf3dgs.training.source_fit import fit_sources
+from rf3dgs.training.timed_mirrors import timed_mirrors
 
 SIZE = torch.tensor([9.0, 7.0, 3.2])
 TX = torch.tensor([2.1, 1.7, 2.6])
@@ -131,6 +132,7 @@ def test_the_walls_are_refined_by_the_peaks(spectra):
 
 def test_a_wall_that_geometry_lacks_is_found_from_the_peaks(spectra):
     """Without the east wall its image is met by bearings; the plane is the bisector, and its surface where it shone."""
+    spectra = replace(spectra, delay=None, aod=None)
     for without in (1, 5):
         fit = fit_sources(spectra, walls(without=without), FREE, Pose(TX), SourceConfig())
         truth = walls().planes
@@ -141,6 +143,29 @@ def test_a_wall_that_geometry_lacks_is_found_from_the_peaks(spectra):
             fit_sources(spectra, walls(without=without), FREE, Pose(TX), SourceConfig(complete=False)).sources
         )
         assert missed(fit.sources)[0] < 0.75 * known[0]
+
+
+def test_delay_and_departure_of_single_peaks_tell_the_walls(spectra):
+    """Six images of one reflection, each in its place; what two or three reflections made is not taken for a wall."""
+    truth, found = walls().planes, timed_mirrors(spectra, TX)
+    assert len(found) == 6
+    for mirror in found:
+        plane = int((truth.normals @ mirror.normal).argmax())
+        # Half a pixel of bearing is a degree; the median of a few images 5 m away is within 3 cm.
+        assert float(truth.normals[plane] @ mirror.normal) > math.cos(math.radians(0.5))
+        assert abs(float(truth.offsets[plane] - mirror.offset)) < 0.03
+        assert float((mirror.points @ truth.normals[plane] - truth.offsets[plane]).abs().max()) < 0.05
+    assert timed_mirrors(replace(spectra, delay=None, aod=None), TX) == []
+
+
+def test_a_wall_far_from_its_place_is_moved_into_it(spectra):
+    """27 cm are more than bearings can be matched over: the wall's rays lie 5 degrees beside its peaks."""
+    wrong = walls(moved=0.27)
+    fit = fit_sources(spectra, wrong, FREE, Pose(TX), SourceConfig())
+    assert len(fit.sources.planes) == 6
+    assert float((fit.sources.planes.offsets - walls().planes.offsets).abs().max()) < 0.03
+    assert missed(fit.sources)[0] < 0.1
+    assert missed(fit_sources(spectra, wrong, FREE, Pose(TX), SourceConfig(complete=False)).sources)[0] > 0.5
 
 
 def test_points_rule_the_pixels_of_their_beams(fitted, spectra):

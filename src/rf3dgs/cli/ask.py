@@ -39,6 +39,9 @@ class Render:
     """Width and height [pixel]: 300 200 for a pinhole, 360 180 for a sphere unless given."""
     fov_deg: float = 90.0
     """Horizontal field of view of a pinhole [deg]."""
+    part: Literal["all", "sources", "lit", "ambient"] = "all"
+    """One part of a field of the mirror model alone: point sources, surfaces lit straight from the transmitter, or what
+    comes by other ways."""
 
     def run(self) -> int:
         """Render, write the file and say what is in it."""
@@ -50,6 +53,7 @@ class Render:
         if self.out.suffix not in (".png", ".npz"):
             raise InputError(f"--out must end in .png or .npz; got {self.out}")
         field = moved_field(open_field(self.field), self.tx)
+        field = field if self.part == "all" else field.only(self.part)
         if self.grid == "sphere":
             grid = equirect_grid(*(self.size or (360, 180)))
             pose = Pose(self.at) if self.towards is None else Pose.look_at(self.at, self.towards)

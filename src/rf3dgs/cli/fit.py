@@ -188,6 +188,7 @@ def fit_field(
 ) -> None:
     """Train the radio stage with checkpoints, save the field, and say how large it is; `source` names the geometry."""
     from rf3dgs.cli.chain import gaussian_count
+    from rf3dgs.training.explain import Explained
     from rf3dgs.training.radio import fit_radio
 
     check_output(path)
@@ -200,6 +201,9 @@ def fit_field(
     drop_checkpoints(path)
     size = sum(file.stat().st_size for file in path.iterdir()) / 1e6
     out(f"{path}: {gaussian_count(trained)} Gaussians, {size:.1f} MB")
+    parts = Explained.of_meta(trained.meta)
+    if parts is not None:
+        out(parts.text())
 
 
 def check_output(path: Path) -> None:

@@ -9,7 +9,8 @@ the transmitter p, cos_i = max(n . w, 0.01), r = 2 (n . w) n - w and v = (q - mu
     L       = (lit + ambient) 10^(E(v) / 10),  E in -12..12 dB
 
 R, b, alpha, A and e belong to the Gaussian's segment; E is the sum of harmonics of its segment and of its cell and of a
-level of its own. Powers are blended through the Gaussians with a depth gate and divided by the accumulated weight, so
+level of its own. Delay and departure are means of both parts weighted by power, plus a residual F(v) that is made up in
+the same way. Powers are blended through the Gaussians with a depth gate and divided by the accumulated weight, so
 that gaps between Gaussians neither leak nor darken. A picture of a surface has the channels
 
     0      power over `unit`
@@ -18,8 +19,9 @@ that gaps between Gaussians neither leak nor darken. A picture of a surface has 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -33,7 +35,12 @@ from rf3dgs.splats.compositing import Compositing
 from rf3dgs.splats.harmonics import C0, evaluate, view_directions
 from rf3dgs.splats.rasterize import Backend, rasterize
 
+Part = Literal["sources", "lit", "ambient"]
+PARTS: tuple[Part, ...] = ("sources", "lit", "ambient")
+SILENT_DB = -300.0  # of an ambient level that is to be nothing
 HARMONICS = 16
+CSI_DEGREE = 2
+CSI_HARMONICS = (CSI_DEGREE + 1) ** 2
 LAW = ("level_db", "incidence", "lobe", "ambient_db", "falloff")
 """Columns of `LitSurface.laws`: R [dB at 1 m], b, alpha, A [dB at 5 m], e."""
 LARGEST_RESIDUAL_DB = 12.0
@@ -53,6 +60,8 @@ class LitSurface:
     segment_sh `[S, 16]`, cell_sh `[C, 16]`, level `[N]`: the residual E [dB], harmonics of the direction from the
         receiver to the Gaussian and a level.
     ambient `[N, 4]`: delay [ns] of the ambient part from the transmitter to the Gaussian, and its departure vector.
+    segment_csi `[S, 9, 4]`, cell_csi `[C, 9, 4]`, own_csi `[N, 4]`: the residual F of delay [ns] and departure vector,
+        coefficients of degree 2 (middle axis) of the same direction, and a constant.
     tx `[3]`: the transmitter's position [m]. window: in which pictures of the field are drawn; decides nothing else.
     """
 
@@ -69,6 +78,9 @@ class LitSurface:
     cell_sh: Tensor
     level: Tensor
     ambient: Tensor
+    segment_csi: Tensor
+    cell_csi: Tensor
+    own_csi: Tensor
     tx: Tensor
     window: DbWindow
 
@@ -87,6 +99,9 @@ class LitSurface:
             "cell_sh": (cells, HARMONICS),
             "level": (count,),
             "ambient": (count, 4),
+            "segment_csi": (segments, CSI_HARMONICS, 4),
+            "cell_csi": (cells, CSI_HARMONICS, 4),
+            "own_csi": (count, 4),
             "tx": (3,),
         }
         for name, shape in shapes.items():
@@ -156,6 +171,7 @@ class LitSurface:
             return power
         late = torch.linalg.vector_norm(self.means - receiver, dim=-1) / (SPEED_OF_LIGHT * NANOSECOND)
         weighted = lit[:, None] * self._bounce + ambient[:, None] * self.ambient
+        weighted += power * evaluate(self._csi, directions)
         weighted[:, 0] += power[:, 0] * late
         return torch.cat((power, weighted), -1)
 
@@ -166,12 +182,19 @@ class LitSurface:
         lobe = (0.5 + 0.5 * cosine).clamp_min(1e-6).pow(self._lobe)
         return self._arriving * lobe, self._ambient_power
 
+    def only(self, part: Part) -> "LitSurface":
+        """The lit or the ambient part, or neither for "sources"; each with the residual, so that they add up."""
+        silent = self.laws.clone()
+        silent[:, 3], silent[:, 4] = SILENT_DB, 0.0
+        dark = torch.zeros_like(self.visibility)
+        laws = self.laws if part == "ambient" else silent
+        return replace(self, laws=laws, visibility=self.visibility if part == "lit" else dark)
+
     def without_residual(self) -> "LitSurface":
         """The laws alone: lit and ambient, E = 0."""
-        from dataclasses import replace
-
         zero = torch.zeros_like
-        return replace(self, segment_sh=zero(self.segment_sh), cell_sh=zero(self.cell_sh), level=zero(self.level))
+        names = ("segment_sh", "cell_sh", "level", "segment_csi", "cell_csi", "own_csi")
+        return replace(self, **{name: zero(getattr(self, name)) for name in names})
 
     @cached_property
     def _geometry(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -201,6 +224,13 @@ class LitSurface:
     def _harmonics(self) -> Tensor:
         """The residual's coefficients `[N, 16, 1]`, all levels together."""
         return combined(self.segment_sh[self.segment_of], self.cell_sh[self.cell_of], self.level)
+
+    @cached_property
+    def _csi(self) -> Tensor:
+        """The coefficients `[N, 9, 4]` of the residual of delay and departure, all levels together."""
+        total = self.segment_csi[self.segment_of] + self.cell_csi[self.cell_of]
+        total[:, 0] += self.own_csi / C0
+        return total.contiguous()
 
     @cached_property
     def _bounce(self) -> Tensor:

@@ -19,7 +19,7 @@ from rf3dgs.core.angles import angles_of
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid, list_grid, sample_grid, view_of
-from rf3dgs.field.lit import LitSurface
+from rf3dgs.field.lit import PARTS, LitSurface, Part
 from rf3dgs.field.radiance import Radiance, Surface
 from rf3dgs.field.rays import Rays
 from rf3dgs.field.sources import PointSources
@@ -176,6 +176,22 @@ class RadioField:
     def without_sources(self) -> "RadioField":
         """The surface alone."""
         return replace(self, sources=None)
+
+    def only(self, part: Part) -> "RadioField":
+        """One part of a field of the mirror model: "sources", the "lit" surfaces, or what is "ambient".
+
+        Their powers add up to the whole field's; a part that is silent is 300 dB down.
+        """
+        surface = self.surface
+        if part not in PARTS:
+            raise InputError(f"part must be one of {', '.join(PARTS)}; got {part!r}")
+        if not isinstance(surface, LitSurface):
+            raise InputError(
+                "parts belong to the mirror model; this field is of the paper's. Train it with "
+                'RadioConfig(model="mirror")'
+            )
+        sources = self.sources if part == "sources" else None
+        return replace(self, surface=surface.only(part), sources=sources, doubt=None)
 
     def moved_to(self, tx: Pose, *, order: int = 2) -> "RadioField":
         """The field with its transmitter at `tx`, one pose, without any new measurement; mirror model only.

@@ -63,7 +63,7 @@ class PointSources:
     of the line of sight and of all images. planes: P planes; patches: where they have surface, or None for everywhere.
     reflection `[P, 3]`: a, b and c of 10 log10 Gamma = a + b cos + c cos^2 at the angle of incidence, at most 0 dB.
     sequence `[K, 3]`: the planes of each source in the order from the transmitter, -1 beyond the last; the first row is
-    the line of sight, all -1. open_above: the transmittance of a way above which it is open. marks: where planes
+    the line of sight, all -1. open_above: the transmittance of a leg above which a way is open. marks: where planes
     reflect otherwise, or None. mirrors `[P]`: False for planes that were found to mirror nothing, or None where nobody
     knows; it decides in which planes images are sought for another transmitter.
     """
@@ -158,7 +158,8 @@ class PointSources:
     def transmittance(self, ways: Ways, receivers: np.ndarray, obstacles: Obstacles) -> np.ndarray:
         """Share `[w]` that passes on ways to `receivers` `[n, 3]` [m].
 
-        The product over the legs of a way; Gaussians of the planes that a leg joins do not stand in its way.
+        The geometric mean over the legs of a way, so that a longer way through the same haze is as open; Gaussians of
+        the planes that a leg joins do not stand in its way.
         """
         longest = int(self.plan.order.max())
         first = np.broadcast_to(self.plan.chain[0, 0], (len(ways), 1, 3))
@@ -172,7 +173,8 @@ class PointSources:
             skip_start=torch.from_numpy(labels[:, :-1].reshape(-1)) if known else None,
             skip_end=torch.from_numpy(labels[:, 1:].reshape(-1)) if known else None,
         )
-        return passed.numpy().reshape(-1, longest + 1).prod(-1)
+        legs = self.plan.order[ways.source] + 1
+        return passed.numpy().reshape(-1, longest + 1).prod(-1) ** (1 / legs)
 
     def rays(self, receiver: Tensor, obstacles: Obstacles) -> Rays:
         """What reaches a receiver at `receiver` `[3]` [m]."""

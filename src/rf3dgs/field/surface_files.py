@@ -7,13 +7,17 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.errors import DataError
-from rf3dgs.field.lit import HARMONICS, LAW, LitSurface
+from rf3dgs.field.lit import CSI_HARMONICS, HARMONICS, LAW, LitSurface
 from rf3dgs.field.radiance import CSI_CHANNELS, CSI_DEGREE, Surface
 from rf3dgs.spectra.codec import DbWindow
 
 MIRROR, PAPER = "mirror", "paper"
 SHAPE = ("quats", "log_scales", "logit_opacities")
-HALF = {MIRROR: (*SHAPE, "normals", "segment_sh", "cell_sh", "level", "ambient"), PAPER: (*SHAPE, "gain_sh", "csi_sh")}
+CSI = ("segment_csi", "cell_csi", "own_csi")
+HALF = {
+    MIRROR: (*SHAPE, "normals", "segment_sh", "cell_sh", "level", "ambient", *CSI),
+    PAPER: (*SHAPE, "gain_sh", "csi_sh"),
+}
 """What is stored in float16, by model."""
 NUMBERS = ("segment_of", "cell_of")
 LARGEST_LOGIT = 30.0
@@ -49,14 +53,16 @@ def surface_record(surface: Surface | LitSurface) -> dict[str, Any]:
         "prior_tx": surface.tx.tolist(),
     }
     if isinstance(surface, LitSurface):
-        return record | {"segments": len(surface.laws), "cells": len(surface.cell_sh)}
+        counts = {"segments": len(surface.laws), "cells": len(surface.cell_sh)}
+        return record | counts | {"csi_coefficients": surface.cell_csi.shape[1]}
     return record | {"gain_coefficients": surface.gain_sh.shape[1], "delay_span": surface.delay_span}
 
 
 def surface_kinds(body: Mapping[str, Any]) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
     """Shape and type of every tensor of the surface that the description `body` promises.
 
-    Descriptions of before there were two models name none; theirs is the paper's.
+    Descriptions of before there were two models name none; theirs is the paper's. Those of before delay and departure
+    had a residual name no coefficients of it.
     """
     count, model = int(body["gaussians"]), body.get("model", PAPER)
     if model not in HALF:
@@ -75,7 +81,18 @@ def surface_kinds(body: Mapping[str, Any]) -> dict[str, tuple[tuple[int, ...], t
             "csi_sh": ((count, (CSI_DEGREE[encoding] + 1) ** 2, CSI_CHANNELS[encoding]), half),
         }
     segments, cells = int(body["segments"]), int(body["cells"])
-    return shape | {
+    coefficients = int(body.get("csi_coefficients", 0))
+    if coefficients not in (0, CSI_HARMONICS):
+        raise DataError(
+            f"field.json: csi_coefficients must be {CSI_HARMONICS}, or left out where delay and departure have no "
+            f"residual; got {coefficients}. Use a newer version"
+        )
+    csi = {
+        "segment_csi": ((segments, coefficients, 4), half),
+        "cell_csi": ((cells, coefficients, 4), half),
+        "own_csi": ((count, 4), half),
+    }
+    mirror = {
         "normals": ((count, 3), half),
         "visibility": ((count,), torch.uint8),
         "segment_of": ((count,), torch.int32),
@@ -86,6 +103,7 @@ def surface_kinds(body: Mapping[str, Any]) -> dict[str, tuple[tuple[int, ...], t
         "level": ((count,), half),
         "ambient": ((count, 4), half),
     }
+    return shape | mirror | (csi if coefficients else {})
 
 
 def surface_of(
@@ -93,10 +111,14 @@ def surface_of(
 ) -> Surface | LitSurface:
     """The surface of checked tensors."""
     model = body.get("model", PAPER)
-    values = {name: tensors[name].float() for name in HALF[model]}
+    values = {name: tensors[name].float() for name in HALF[model] if name in surface_kinds(body)}
     if model == PAPER:
         means, encoding = tensors["means"], body["encoding"]
         return Surface(means=means, **values, tx=tx, window=window, encoding=encoding, delay_span=delay_span)
+    if not set(CSI) <= set(values):
+        groups = (len(values["segment_sh"]), len(values["cell_sh"]))
+        none = [torch.zeros(group, CSI_HARMONICS, 4) for group in groups]
+        values |= dict(zip(CSI, (*none, torch.zeros(len(values["level"]), 4)), strict=True))
     return LitSurface(
         means=tensors["means"],
         **values,

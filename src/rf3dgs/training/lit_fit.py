@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.units import SPEED_OF_LIGHT
-from rf3dgs.field.lit import AMBIENT_DISTANCE, HARMONICS, LARGEST_RESIDUAL_DB, LitSurface, incidence
+from rf3dgs.field.lit import AMBIENT_DISTANCE, CSI_HARMONICS, HARMONICS, LARGEST_RESIDUAL_DB, LitSurface, incidence
 from rf3dgs.field.radiance import NANOSECOND, bounce
 from rf3dgs.splats.harmonics import C0, basis, view_directions
 from rf3dgs.splats.rasterize import Backend
@@ -161,6 +161,7 @@ class Ridge:
 
 
 RIDGE = Ridge()
+CSI_RIDGE = Ridge(segment=5.0, cell=5.0, level=2.0)
 
 
 def refine_residual(
@@ -207,7 +208,51 @@ def _corrected(surface: LitSurface, views: Sequence[LitView], lacking: Shortfall
     total = torch.zeros(len(surface)).index_add_(0, lacking.gaussian, weight)
     own = torch.zeros(len(surface)).index_add_(0, lacking.gaussian, weight * left_over) / (total + ridge.level)
     level = (surface.level + own).clamp(-LARGEST_RESIDUAL_DB, LARGEST_RESIDUAL_DB)
-    return replace(surface, segment_sh=surface.segment_sh + found[0], cell_sh=surface.cell_sh + found[1], level=level)
+    surface = replace(
+        surface, segment_sh=surface.segment_sh + found[0], cell_sh=surface.cell_sh + found[1], level=level
+    )
+    if lacking.csi_weight is None or lacking.csi_error is None:
+        return surface
+    parts = [
+        _csi_corrected(surface, lacking.gaussian, harmonics[:, :CSI_HARMONICS], weight, error, CSI_RIDGE)
+        for weight, error in (
+            (lacking.csi_weight[:, 0], lacking.csi_error[:, :1]),
+            (lacking.csi_weight[:, 1], lacking.csi_error[:, 1:]),
+        )
+    ]
+    segment, cell, own = (torch.cat(part, -1) for part in zip(*parts, strict=True))
+    return replace(
+        surface,
+        segment_csi=surface.segment_csi + segment,
+        cell_csi=surface.cell_csi + cell,
+        own_csi=surface.own_csi + own,
+    )
+
+
+def _csi_corrected(
+    surface: LitSurface, gaussian: Tensor, harmonics: Tensor, weight: Tensor, error: Tensor, ridge: Ridge
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What delay or departure lacks: coefficients `[S, K, c]` of segments, `[C, K, c]` of cells, constants `[N, c]`."""
+    weight = _worth(weight)
+    columns, channels = harmonics.shape[1], error.shape[1]
+    penalty = C0**2 * torch.diag((1.0 + BAND[:columns]) ** 2)
+    left_over, found = error, []
+    for group, groups, strength in (
+        (surface.segment_of, len(surface.laws), ridge.segment),
+        (surface.cell_of, len(surface.cell_sh), ridge.cell),
+    ):
+        number = group[gaussian]
+        weighted = harmonics * weight[:, None]
+        left, right = torch.zeros(groups, columns**2), torch.zeros(groups, columns * channels)
+        left.index_add_(0, number, (weighted[:, :, None] * harmonics[:, None, :]).flatten(1))
+        right.index_add_(0, number, (weighted[:, :, None] * left_over[:, None, :]).flatten(1))
+        left = left.reshape(groups, columns, columns) + strength * penalty
+        correction = torch.linalg.solve(left, right.reshape(groups, columns, channels))
+        left_over = left_over - (harmonics[:, :, None] * correction[number]).sum(1)
+        found.append(correction)
+    total = torch.zeros(len(surface)).index_add_(0, gaussian, weight)
+    own = torch.zeros(len(surface), channels).index_add_(0, gaussian, weight[:, None] * left_over)
+    return found[0], found[1], own / (total + ridge.level)[:, None]
 
 
 def fit_ambient(scattering: Scattering, seen: Observations, laws: Tensor, ridge: float = 1.0) -> Tensor:

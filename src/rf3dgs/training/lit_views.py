@@ -24,6 +24,7 @@ from rf3dgs.training.radio_views import ruled
 LEAST_WEIGHT = 0.02  # [pixel]; what a view tells of fainter Gaussians is left out
 LEAST_POWER = 1e-30
 FARTHEST_DB = 15.0  # errors of pixels beyond this count as this
+SOFT_NS, SOFT_TURN = 1.0, 0.1  # errors of delay [ns] and departure [rad] that count as squares; absolutely beyond
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +68,18 @@ class Observations:
 @dataclass(frozen=True, eq=False)
 class Shortfall:
     """What a surface lacks, one row for each pair of Gaussian and view: gaussian, view `[M]` long; weight `[M]`: pixels
-    times the Gaussian's share in their power; error_db `[M]`: mean of truth over model, weighted so."""
+    times the Gaussian's share in their power; error_db `[M]`: mean of truth over model, weighted so.
+
+    csi_weight `[M, 2]`, csi_error `[M, 4]`: the same of delay [ns] and of the departure vector, or None. Pixels of
+    large errors count less there, so that what is fitted are medians rather than means.
+    """
 
     gaussian: Tensor
     view: Tensor
     weight: Tensor
     error_db: Tensor
+    csi_weight: Tensor | None = None
+    csi_error: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.gaussian)
@@ -139,26 +146,49 @@ def shortfall(surface: LitSurface, views: Sequence[LitView], floor_db: float, ba
     count as that.
     """
     shape = (surface.means, surface.quats, surface.scales, surface.opacities)
+    has_csi = all(view.channels.shape[-1] == 5 for view in views)
     rows = []
     for number, one in enumerate(views):
         with torch.no_grad():
-            sent = surface.values(one.view.position, csi=False)
-        values = sent.expand(-1, 2).contiguous().requires_grad_()
+            values = surface.values(one.view.position, csi=has_csi)
+            sent = values[:, :1]
+            # The weights do not depend on what is blended: channels beyond the model's own bring back more sums.
+            values = torch.cat((values, sent.expand(-1, 3 if has_csi else 1)), -1).requires_grad_()
         with torch.enable_grad():
             raster = rasterize(*shape, values, one.view, compositing=BLENDING, backend=backend)
-            shown = raster.values.detach()[..., 0]
-            there = one.keep * (shown > 0)
-            floor = (one.floor / surface.unit).clamp_min(10 ** (floor_db / 10) / surface.unit)
-            truth = torch.maximum((one.channels[..., 0] / surface.unit).float(), floor)
-            error = 10 * torch.log10(truth / torch.maximum(shown, floor))
-            share = there / torch.where(shown > 0, shown, 1.0)
-            upstream = torch.stack((share, share * error.clamp(-FARTHEST_DB, FARTHEST_DB)), -1)
+            upstream = _lacking(raster.values.detach(), one, surface.unit, floor_db)
             (sums,) = torch.autograd.grad(raster.values, values, upstream)
         sums = sums * sent
         chosen = (sums[:, 0] > LEAST_WEIGHT).nonzero().squeeze(-1)
         rows.append((chosen, torch.full_like(chosen, number), sums[chosen]))
     gaussian, view, sums = _joined(rows)
-    return Shortfall(gaussian, view, sums[:, 0].contiguous(), sums[:, 1] / sums[:, 0])
+    level = (gaussian, view, sums[:, 0].contiguous(), sums[:, 1] / sums[:, 0])
+    if not has_csi:
+        return Shortfall(*level)
+    weight = sums[:, [2, 4]]
+    error = torch.cat((sums[:, 3:4], sums[:, 5:]), -1) / weight.clamp_min(1e-9)[:, [0, 1, 1, 1]]
+    return Shortfall(*level, weight, error)
+
+
+def _lacking(shown: Tensor, one: LitView, unit: float, floor_db: float) -> Tensor:
+    """Per unit of a Gaussian's weight `[row, col, 2 or 8]`: its share in a pixel, and that times the error in dB; its
+    robust share and that times the error in delay; and in departure."""
+    power = shown[..., 0]
+    floor = (one.floor / unit).float().clamp_min(10 ** (floor_db / 10) / unit)
+    truth = (one.channels[..., 0] / unit).float()
+    error = 10 * torch.log10(torch.maximum(truth, floor) / torch.maximum(power, floor))
+    some = torch.where(power > 0, power, 1.0)
+    share = one.keep * (power > 0) / some
+    level = (share, share * error.clamp(-FARTHEST_DB, FARTHEST_DB))
+    if one.channels.shape[-1] == 1:
+        return torch.stack(level, -1)
+    reached = share * (truth >= floor)
+    known = one.channels / torch.where(truth > 0, one.channels[..., 0], 1.0)[..., None]
+    late = known[..., 1].float() - shown[..., 1] / some
+    turned = torch.nn.functional.normalize(known[..., 2:].float(), dim=-1, eps=1e-9) - shown[..., 2:5] / some[..., None]
+    slow = reached * SOFT_NS / late.abs().clamp_min(SOFT_NS)
+    bent = reached * SOFT_TURN / torch.linalg.vector_norm(turned, dim=-1).clamp_min(SOFT_TURN)
+    return torch.stack((*level, slow, slow * late, bent, *(bent[..., None] * turned).unbind(-1)), -1)
 
 
 def _joined(rows: Sequence[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:

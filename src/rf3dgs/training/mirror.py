@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.progress import Progress
-from rf3dgs.field.lit import HARMONICS, LitSurface
+from rf3dgs.field.lit import CSI_HARMONICS, HARMONICS, LitSurface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.geometry import Surfaces, find_surfaces
 from rf3dgs.spectra.codec import DbWindow
@@ -19,6 +19,7 @@ from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles, visibility_of
 from rf3dgs.training.config import RadioConfig, SourceConfig
+from rf3dgs.training.explain import explained
 from rf3dgs.training.lit_fit import Scattering, fit_ambient, fit_laws, refine_residual
 from rf3dgs.training.lit_views import LitView, lit_views, observe
 from rf3dgs.training.source_fit import fit_sources
@@ -55,6 +56,7 @@ def fit_mirror(
     progress.update(2)
     views = lit_views(spectra, found.rays)
     surface = fit_surface(geometry, surfaces, obstacles, views, tx.position, window, config, progress)
+    parts = explained(surface, found.rays, spectra, _floored(window), config.backend)
     progress.finish()
     return RadioField(
         surface=surface,
@@ -66,7 +68,7 @@ def fit_mirror(
         tx=tx,
         bounds=torch.stack((positions.amin(0), positions.amax(0))),
         colour=colour,
-        meta=meta | {"positions in sight": int(found.seen.sum()), "segments": len(surface.laws)},
+        meta=meta | {"positions in sight": int(found.seen.sum()), "segments": len(surface.laws)} | parts.meta(),
         backend=config.backend,
     )
 
@@ -86,7 +88,7 @@ def fit_surface(
     cells = cells_of(geometry.means, surfaces.segment_of)
     scattering = Scattering.of(geometry.means, surfaces.normals, visibility, surfaces.segment_of, cells, tx)
     seen = observe(geometry, views, unit=10 ** (window.ceil_db / 10), backend=config.backend)
-    floor_db = max(window.floor_db, window.ceil_db - DEEPEST_DB)
+    floor_db = _floored(window).floor_db
     seen = replace(seen, level_db=seen.level_db.clamp_min(floor_db))
     progress.update(3)
     laws = fit_laws(scattering, seen)
@@ -105,12 +107,19 @@ def fit_surface(
         cell_sh=torch.zeros(int(cells.max()) + 1, HARMONICS),
         level=torch.zeros(len(geometry)),
         ambient=fit_ambient(scattering, seen, laws),
+        segment_csi=torch.zeros(len(laws), CSI_HARMONICS, 4),
+        cell_csi=torch.zeros(int(cells.max()) + 1, CSI_HARMONICS, 4),
+        own_csi=torch.zeros(len(geometry), 4),
         tx=tx,
         window=window,
     )
     surface = refine_residual(bare, views, passes=PASSES, floor_db=floor_db, backend=config.backend)
     progress.update(5)
     return surface
+
+
+def _floored(window: DbWindow) -> DbWindow:
+    return DbWindow(max(window.floor_db, window.ceil_db - DEEPEST_DB), window.ceil_db)
 
 
 def cells_of(means: Tensor, segment_of: Tensor) -> Tensor:

@@ -11,17 +11,20 @@ from rf3dgs.field.images import HIGHEST_ORDER
 from rf3dgs.field.moving import with_images as images_among
 from rf3dgs.field.rays import Rays
 from rf3dgs.field.sources import PointSources
-from rf3dgs.geometry import Surfaces
+from rf3dgs.geometry import Patches, Planes, Surfaces
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
 from rf3dgs.training.consolidation import consolidated, with_skins
 from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
 from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_marks, fit_reflection, glints, silent_planes
+from rf3dgs.training.timed_mirrors import timed_mirrors, with_timed
 from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, refined_planes, with_mirrors
 
 PROBES = 150
 PROBE_MARGIN = 0.5
+GATES = (0.2, 0.3, 0.1, 0.05, 0.5)  # of transmittance a leg; of equally good ones the first
+SIGHT_WEIGHT = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,22 +68,22 @@ def fit_sources(
     surfaces = consolidated(surfaces, obstacles.means)
     obstacles = replace(obstacles, labels=surfaces.plane_of)
     sources = _known(direct, surfaces)
+    timed = timed_mirrors(spectra, tx.position) if config.complete else []
+    if timed:
+        sources, surfaces, obstacles = _over(sources, with_timed(sources, timed), surfaces, obstacles)
     sources = with_images(sources, probes, replace(config, order=1))
     peaks = peaks_of(spectra) if config.refine or config.complete else None
     if peaks is not None and config.refine:
         sources = _refined(sources, seen, peaks, positions, obstacles, config)
-    if peaks is not None and config.complete:
+    if peaks is not None and config.complete and not timed:
         every = _fitted(sources, spectra, seen, obstacles)
         every = with_images(every, probes, config)
         mirrors = find_mirrors(every, every.rays_each(positions, obstacles, in_sight=seen), peaks, spectra, obstacles)
         if mirrors:
-            sources = completed(sources, *with_mirrors(sources, mirrors))
-            assert sources.patches is not None
-            surfaces = replace(surfaces, planes=sources.planes, patches=sources.patches)
-            surfaces = replace(surfaces, plane_of=with_skins(surfaces, obstacles.means))
-            obstacles = replace(obstacles, labels=surfaces.plane_of)
+            sources, surfaces, obstacles = _over(sources, with_mirrors(sources, mirrors), surfaces, obstacles)
             sources = with_images(sources, probes, replace(config, order=1))
             sources = _refined(sources, seen, peaks, positions, obstacles, config)
+    sources = _gated(sources, spectra, seen, obstacles)
     rays = sources.rays_each(positions, obstacles, in_sight=seen)
     found = glints(sources, rays, spectra)
     reflection = fit_reflection(found, len(sources.planes))
@@ -103,6 +106,17 @@ def with_images(
     return images_among(sources, probes, order=config.order, planes=config.planes, largest=config.largest)
 
 
+def _over(
+    sources: PointSources, found: tuple[Planes, Patches], surfaces: Surfaces, obstacles: Obstacles
+) -> tuple[PointSources, Surfaces, Obstacles]:
+    """Sources and surfaces over the planes that were found, and obstacles that know which Gaussians belong to them."""
+    planes, patches = found
+    sources = completed(sources, planes, patches)
+    surfaces = replace(surfaces, planes=planes, patches=patches)
+    surfaces = replace(surfaces, plane_of=with_skins(surfaces, obstacles.means))
+    return sources, surfaces, replace(obstacles, labels=surfaces.plane_of)
+
+
 def _known(direct: PointSources, surfaces: Surfaces) -> PointSources:
     """The transmitter among the planes of the geometry, which reflect as dielectrics do, so far."""
     reflection = torch.tensor(DIELECTRIC).expand(len(surfaces.planes), 3)
@@ -113,6 +127,25 @@ def _fitted(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: O
     """The sources with what each plane reflects."""
     rays = sources.rays_each(spectra.pose.position, obstacles, in_sight=seen)
     return replace(sources, reflection=fit_reflection(glints(sources, rays, spectra), len(sources.planes)))
+
+
+def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Obstacles) -> PointSources:
+    """The sources with the threshold that agrees best with who sees the transmitter, and which reflections shine.
+
+    A way that is open and should not be counts twice: it misleads a beam, where one that is missing only costs its own
+    power. The line of sight counts thrice.
+    """
+    ways = [sources.candidates(position, obstacles) for position in spectra.pose.position]
+    looked = glints(sources, [rays for rays, _ in ways], spectra)
+    passed = torch.zeros(len(spectra), len(sources))
+    for place, (rays, share) in enumerate(ways):
+        passed[place, rays.index] = share
+    gates = torch.tensor(GATES)[:, None]
+    wrong = SIGHT_WEIGHT * ((passed[:, 0] > gates) != seen).sum(-1)
+    shone = passed[looked.position, looked.source][looked.alone]
+    glints_seen = looked.seen[looked.alone]
+    wrong = wrong + 2 * ((shone > gates) & ~glints_seen).sum(-1) + ((shone <= gates) & glints_seen).sum(-1)
+    return replace(sources, open_above=GATES[int(wrong.argmin())])
 
 
 def _refined(

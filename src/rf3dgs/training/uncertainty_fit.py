@@ -65,7 +65,7 @@ def fit_uncertainty(field: RadioField, spectra: Spectrum, *, progress: Progress 
         )
     folds = folds_of(spectra.pose.position, seed=int(field.meta.get("seed", 0)))
     progress.start("uncertainty", len(folds))
-    views = lit_views(spectra, _rays(field, spectra))
+    views = lit_views(replace(spectra, delay=None, aod=None), _rays(field, spectra))
     shape = (surface.means, surface.quats, surface.log_scales, surface.logit_opacities)
     observed = observe(
         Gaussians(*shape, torch.zeros(len(surface), 1, 1)), views, unit=surface.unit, backend=field.backend

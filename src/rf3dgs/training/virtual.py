@@ -256,12 +256,12 @@ def with_mirrors(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, 
             normals.append(mirror.normal)
             offsets.append(mirror.offset)
             points.append(torch.zeros(0, 3))
-        points[place] = torch.cat((points[place], _discs(mirror)))
+        points[place] = torch.cat((points[place], discs(mirror)))
     planes = Planes(torch.stack(normals), torch.stack(offsets))
     return planes, Patches.of(planes, points)
 
 
-def _discs(mirror: Mirror) -> Tensor:
+def discs(mirror: Mirror) -> Tensor:
     """Points `[n, 3]` all over discs of surface around where a mirror was seen to reflect.
 
     Discs reach as far as the third nearest such place, so that sparse observations still close to one surface.

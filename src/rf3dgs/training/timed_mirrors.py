@@ -1,0 +1,150 @@
+"""Mirrors told by single peaks: bearing, delay and departure of one peak say where the image stands and whether one
+reflection made it.
+
+A receiver at q that sees a mirror in direction u after the delay tau has the transmitter's image at s = q + c tau u. If
+there was one reflection, the mirror is the bisector of the transmitter and s, and the wave left towards the point in
+which the way from q to s meets it; after two reflections it left in another direction. Images of one mirror are one
+point for all receivers.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from rf3dgs.core.angles import angle_between
+from rf3dgs.core.units import SPEED_OF_LIGHT
+from rf3dgs.field.images import image_chain, sequences
+from rf3dgs.field.sources import PointSources
+from rf3dgs.geometry import Patches, Planes
+from rf3dgs.spectra.peaks import find_peaks
+from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.training.consolidation import surface_points
+from rf3dgs.training.line_of_sight import standing_out
+from rf3dgs.training.virtual import NEAREST_IMAGE, PEAKS, Mirror, discs
+
+STANDS_OUT = 4.0  # over the surroundings: a peak's delay is then nearly its own
+DEPARTURE = math.radians(2.0)
+SAME_IMAGE = 0.3  # m
+LEAST_POSITIONS = 4
+MOST_FOUND = 20
+SAME_ANGLE, SAME_DISTANCE = math.cos(math.radians(10.0)), 0.5
+ROUNDS = 5
+
+
+def timed_mirrors(spectra: Spectrum, tx: Tensor) -> list[Mirror]:
+    """The mirrors that peaks of `spectra` `[position, row, col]` tell of a transmitter at `tx` `[3]`, those that most
+    positions see first; none where spectra have no delay or departure.
+
+    An image counts that four positions see within 30 cm of one place, unless two or three reflections in the mirrors
+    that more positions see put one there, too: three in floor and ceiling leave the transmitter as one does.
+    """
+    position, image = _images(spectra, tx)
+    receivers, mirrors = spectra.pose.position, []
+    while len(mirrors) < MOST_FOUND and len(position):
+        near = torch.cdist(image, image) < SAME_IMAGE
+        seen_by = torch.zeros(len(image), len(receivers)).index_add_(1, position, near.float()) > 0
+        best = int(seen_by.sum(-1).argmax())
+        if int(seen_by[best].sum()) < LEAST_POSITIONS:
+            break
+        chosen, middle = near[best], image[best]
+        for _ in range(ROUNDS):
+            middle = image[chosen].median(0).values
+            chosen = torch.linalg.vector_norm(image - middle, dim=-1) < SAME_IMAGE
+        normal, offset = _bisector(tx, middle)
+        origin = receivers[position[chosen]]
+        points, ahead = _crossing(origin, middle, tx, normal, offset)
+        if bool(ahead.any()) and not _is_image_of_image(middle, tx, mirrors):
+            mirrors.append(Mirror(normal, offset, points[ahead], middle, origin[ahead]))
+        position, image = position[~(chosen | near[best])], image[~(chosen | near[best])]
+    return mirrors
+
+
+def with_timed(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, Patches]:
+    """Planes and patches put right by mirrors.
+
+    A plane within 10 degrees and 50 cm of a mirror, at the places where that was seen to reflect, is moved into it and
+    has surface there, the largest such plane alone; a mirror without one is a new plane.
+    """
+    assert sources.patches is not None
+    normals, offsets = list(sources.planes.normals), list(sources.planes.offsets)
+    points = [surface_points(sources.planes, sources.patches, plane) for plane in range(len(sources.planes))]
+    largest = sources.patches.areas.argsort(descending=True, stable=True).tolist()
+    taken: set[int] = set()
+    for mirror in mirrors:
+        middle = mirror.points.median(0).values
+        for plane in largest:
+            same = abs(float(normals[plane] @ mirror.normal)) > SAME_ANGLE and plane not in taken
+            if same and abs(float(normals[plane] @ middle - offsets[plane])) < SAME_DISTANCE:
+                side = float((normals[plane] @ mirror.normal).sign())
+                normals[plane], offsets[plane] = side * mirror.normal, side * mirror.offset
+                break
+        else:
+            plane = len(points)
+            normals.append(mirror.normal)
+            offsets.append(mirror.offset)
+            points.append(torch.zeros(0, 3))
+        taken.add(plane)
+        points[plane] = torch.cat((points[plane], discs(mirror)))
+    planes = Planes(torch.stack(normals), torch.stack(offsets))
+    flat = [
+        part - (part @ n - o)[:, None] * n for part, n, o in zip(points, planes.normals, planes.offsets, strict=True)
+    ]
+    return planes, Patches.of(planes, flat)
+
+
+def _is_image_of_image(image: Tensor, tx: Tensor, mirrors: list[Mirror]) -> bool:
+    """Whether two or three reflections in `mirrors` put the transmitter beside `image` `[3]`."""
+    count = len(mirrors)
+    if not count:
+        return False
+    rows = torch.cat((sequences(count, 2), sequences(0, 0, third=torch.arange(count))[1:]))
+    rows = rows[rows[:, 1] >= 0]
+    normals, offsets = (torch.stack([getattr(one, name) for one in mirrors]) for name in ("normal", "offset"))
+    apart = image_chain(tx, normals, offsets, rows)[:, -1] - image
+    return bool((torch.linalg.vector_norm(apart, dim=-1) < 2 * SAME_IMAGE).any())
+
+
+def _images(spectra: Spectrum, tx: Tensor) -> tuple[Tensor, Tensor]:
+    """Positions `[n]` and images `[n, 3]` [m] of the peaks that one reflection explains."""
+    positions, images = [], []
+    if spectra.delay is None or spectra.aod is None:
+        return torch.zeros(0, dtype=torch.long), torch.zeros(0, 3)
+    for number in range(len(spectra)):
+        one = spectra[number]
+        assert one.delay is not None
+        assert one.aod is not None
+        found, _ = find_peaks(one.power, one.grid, count=PEAKS, separation=one.instrument.lobe)
+        for bearing in one.pose.to_world(found):
+            power, ring = standing_out(one, bearing)
+            if not power > (STANDS_OUT - 1) * ring:
+                continue
+            pixel = int((one.directions.reshape(-1, 3) @ bearing).argmax())
+            way = float(one.delay.flatten()[pixel]) * SPEED_OF_LIGHT
+            image = one.pose.position + way * bearing
+            if float(torch.linalg.vector_norm(image - tx)) < NEAREST_IMAGE:
+                continue
+            normal, offset = _bisector(tx, image)
+            point, ahead = _crossing(one.pose.position[None], image, tx, normal, offset)
+            left = one.aod.reshape(-1, 3)[pixel]
+            if (
+                bool(ahead)
+                and float(angle_between(left, torch.nn.functional.normalize(point[0] - tx, dim=-1))) < DEPARTURE
+            ):
+                positions.append(number)
+                images.append(image)
+    where = torch.tensor(positions, dtype=torch.long)
+    return where, torch.stack(images) if images else torch.zeros(0, 3)
+
+
+def _bisector(tx: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+    """Normal `[3]`, towards the transmitter, and offset [m] of the plane in which `tx` is mirrored to `image`."""
+    normal = torch.nn.functional.normalize(tx - image, dim=-1)
+    return normal, normal @ (0.5 * (image + tx))
+
+
+def _crossing(origin: Tensor, image: Tensor, tx: Tensor, normal: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Where ways from `origin` `[n, 3]` to an image cross its mirror `[n, 3]`, and which begin before it `[n]`."""
+    height = origin @ normal - offset
+    share = height / (height + (tx @ normal - offset)).clamp_min(1e-6)
+    return origin + share[:, None] * (image - origin), height > 0
