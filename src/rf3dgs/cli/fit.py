@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FitGeometry:
-    """Visual stage: Gaussians from photographs, from the mesh of a scene, or from a floor plan."""
+    """Visual stage: Gaussians from photographs, from the mesh of a scene, from a floor plan, or from spectra."""
 
     dataset: tyro.conf.Positional[Path | None] = None
     """A dataset folder, or a folder of photographs with poses (COLMAP, nerfstudio, Blender)."""
@@ -40,6 +40,9 @@ class FitGeometry:
     """Take the geometry from this scene's mesh instead of photographs ("lobby", "box", an XML file)."""
     plan: Path | None = None
     """Take the geometry from this floor plan (TOML or JSON) instead of photographs."""
+    spectra: str | None = None
+    """Take the geometry from the training spectra of this dataset instead; with photographs, too, correct it by them.
+    """
     mesh_count: int = 40_000
     """Gaussians on a mesh or a floor plan."""
     flatten: bool = False
@@ -53,17 +56,23 @@ class FitGeometry:
         from rf3dgs.data.formats.detect import read_photos
         from rf3dgs.data.sfm import poses_from_photos
         from rf3dgs.splats.ply import write_ply
+        from rf3dgs.training.radio_geometry import corrected, geometry_from_spectra
         from rf3dgs.training.visual import fit_geometry
 
         if self.out.is_dir():
             raise InputError(f"{self.out} is a folder; name the .ply file to write with --out")
         given = [name for name in ("dataset", "mesh", "plan") if getattr(self, name) is not None]
-        if ("mesh" in given and "plan" in given) or not given:
+        others = ("mesh" in given) + ("plan" in given) + (self.spectra is not None)
+        if others > 1 or not (given or self.spectra):
+            got = " and ".join([*given, *(["spectra"] if self.spectra else [])])
             raise InputError(
-                "geometry comes from a folder of photographs, from --mesh or from --plan; "
-                f"got {' and '.join(given) or 'none of them'}"
+                "geometry comes from a folder of photographs, from --mesh, from --plan or from --spectra; "
+                f"got {got or 'none of them'}"
             )
-        if self.mesh is not None:
+        spectra = None if self.spectra is None else spectra_of(self.spectra)
+        if spectra is not None and self.dataset is None:
+            geometry = geometry_from_spectra(spectra, seed=self.visual.seed)
+        elif self.mesh is not None:
             geometry = _from_mesh(self.mesh, self.mesh_count, self.visual.seed)
         elif self.plan is not None:
             geometry = geometry_of_plan(self.plan, self.mesh_count, self.visual.seed)
@@ -82,6 +91,7 @@ class FitGeometry:
                 photos, self.visual, initial=found.points, progress=console(), checkpoint_dir=with_checkpoints
             )
             geometry = flat_on_planes(geometry, photos) if self.flatten else geometry
+            geometry = geometry if spectra is None else corrected(geometry, spectra, seed=self.visual.seed)
         write_ply(self.out, geometry)
         drop_checkpoints(self.out)
         out(f"{self.out}: {len(geometry):,} Gaussians")
@@ -224,6 +234,13 @@ def training_spectra(dataset: "Dataset") -> "Spectrum":
     except InputError as error:
         raise DataError(f"{dataset.path}/{SPECTRA}: {error}") from error
     return part.spectra
+
+
+def spectra_of(name: str) -> "Spectrum":
+    """The training spectra of the dataset that `name` is."""
+    from rf3dgs.cli.facts import open_dataset
+
+    return training_spectra(open_dataset(name))
 
 
 def check_world(geometry: "Gaussians", positions: "Tensor", source: str) -> None:

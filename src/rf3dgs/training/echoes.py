@@ -6,9 +6,9 @@ its power came in one bounce, the ray from q along u and that from p along a mee
     c tau = |x - p| + |x - q|
 
 After two bounces in one plane the rays may meet as well, but the way by their meeting is longer than the one that was
-taken, or shorter where they meet before they bounce. Power of more bounces that is mixed in makes the mean delay longer,
-leaves u as it is and hardly turns a: the place is that where the rays meet, and the delay, which may be a little long,
-is the witness.
+taken, or shorter where they meet before they bounce. Power of more bounces that is mixed in makes the mean delay
+longer, leaves u as it is and hardly turns a: the place is that where the rays meet, and the delay, which may be a
+little long, is the witness.
 """
 
 from dataclasses import dataclass

@@ -133,8 +133,8 @@ def _of_mirrors(spectra: Spectrum, tx: Pose) -> Gaussians:
     mirrors = find_mirrors(sources, rays, peaks_of(spectra), spectra, none)
     if not mirrors:
         raise InputError(
-            f"no mirror image of the transmitter is seen in {len(spectra)} spectra, which have no delay and departure to "
-            "find echoes by; give spectra at more positions, or with delays"
+            f"{len(spectra)} spectra without delay and departure show no mirror image of the transmitter; give spectra "
+            "at more positions, or with delay and departure"
         )
     return _box(mirrors, torch.cat((positions, tx.position[None], *(one.points for one in mirrors))))
 
