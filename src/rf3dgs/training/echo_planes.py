@@ -25,7 +25,7 @@ STEEP = 0.7  # cosine; planes less steep to each other have no edge
 JOIN = 1.0  # how far from an edge the surface of two planes may end that meet in it [m]
 CROSSINGS = 3  # legs through a square of 30 cm without an echo that open a plane
 VOXEL = 0.15  # [m]
-SHORT = 0.45  # of a leg's ends that proves nothing [m]
+SHORT = 0.25  # of a leg's ends that proves nothing [m]
 PASSED, PASSED_OVER_HIT = 4, 5.0
 
 
@@ -91,15 +91,30 @@ def filled(planes: Planes, patches: Patches, echoes: Echoes) -> Patches:
     Shadows of what stands before a wall are holes in its echoes and not in the wall. Large planes that all receivers
     have in front of them reach to the edges in which they meet. Where waves crossed a plane there is no surface.
     """
-    ends = torch.cat((echoes.receivers, echoes.tx[None]))
-    large = patches.areas >= HULL
-    bounds = large & ((ends @ planes.normals.mT > planes.offsets).float().mean(0).sub(0.5).abs() > 0.45)
+    large, numbers = patches.areas >= HULL, bounding(planes, patches, echoes)
     points = [_closed(planes, patches, plane, [] if large[plane] else None) for plane in range(len(planes))]
-    numbers = torch.nonzero(bounds).squeeze(-1).tolist()
     for plane in 2 * numbers:  # twice, for edges with what has only now grown to its own
         edges = [_edge(planes, plane, other, points[other]) for other in numbers if other != plane]
         points[plane] = _closed(planes, patches, plane, edges)
     return _opened(planes, patches, Patches.of(planes, points), echoes)
+
+
+def bounding(planes: Planes, patches: Patches, echoes: Echoes) -> list[int]:
+    """The large planes that receivers and transmitter have on one side of them, but for one in twenty."""
+    ends = torch.cat((echoes.receivers, echoes.tx[None]))
+    ahead = (ends @ planes.normals.mT > planes.offsets).double().mean(0)
+    return torch.nonzero((patches.areas >= HULL) & ((ahead - 0.5).abs() > 0.45)).squeeze(-1).tolist()
+
+
+def behind(points: Tensor, planes: Planes, patches: Patches, echoes: Echoes) -> Tensor:
+    """True `[point]` where points `[point, 3]` [m] lie behind the surface of a plane that bounds the site."""
+    result = torch.zeros(len(points), dtype=torch.bool)
+    for plane in bounding(planes, patches, echoes):
+        height = points @ planes.normals[plane] - planes.offsets[plane]
+        inside = float(echoes.receivers.mean(0) @ planes.normals[plane] - planes.offsets[plane])
+        beyond = torch.nonzero(height * inside < 0).squeeze(-1)
+        result[beyond] |= patches.holds(points[beyond], torch.full_like(beyond, plane))
+    return result
 
 
 def _closed(planes: Planes, patches: Patches, plane: int, edges: Sequence[Tensor] | None = None) -> Tensor:
@@ -183,7 +198,7 @@ def _hull(cells: Tensor) -> Tensor:
 
 def in_free_space(points: Tensor, echoes: Echoes) -> Tensor:
     """True `[point]` where points `[point, 3]` [m] lie in cubes that waves to and from echoes crossed, four or more,
-    and five times as many as have an echo in the cube or beside it.
+    and five times as many as have an echo in the cube.
     """
     ends, bounce = legs_of(echoes)
     low = torch.minimum(ends.amin(0), torch.minimum(bounce.amin(0), points.amin(0))) - 2 * VOXEL
@@ -204,8 +219,7 @@ def in_free_space(points: Tensor, echoes: Echoes) -> Tensor:
         leg, step = torch.nonzero(inside, as_tuple=True)
         way = start[leg] + (steps[step] / length[leg])[:, None] * (end[leg] - start[leg])
         passed += torch.bincount(cube(way), minlength=len(passed))
-    hit = torch.bincount(cube(echoes.points), minlength=len(passed)).float().reshape(*shape.tolist())
-    hit = 27 * torch.nn.functional.avg_pool3d(hit[None, None], 3, stride=1, padding=1)[0, 0].flatten()
+    hit = torch.bincount(cube(echoes.points), minlength=len(passed))
     own = cube(points)
     return (passed[own] >= PASSED) & (passed[own] > PASSED_OVER_HIT * hit[own])
 

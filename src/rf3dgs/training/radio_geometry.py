@@ -1,6 +1,7 @@
 """Geometry out of spectra, without photographs or a plan; and geometry out of photographs, corrected by spectra."""
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -17,7 +18,16 @@ from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.splats.surface import ALONG
 from rf3dgs.training.consolidation import consolidated
-from rf3dgs.training.echo_planes import cells_of, filled, in_free_space, owner_of, refined_by_echoes
+from rf3dgs.training.echo_planes import (
+    LEAST_WITNESSES,
+    REGION,
+    behind,
+    cells_of,
+    filled,
+    in_free_space,
+    owner_of,
+    refined_by_echoes,
+)
 from rf3dgs.training.echoes import Echoes, Spots, echoes_of, merged
 from rf3dgs.training.line_of_sight import fit_line_of_sight
 from rf3dgs.training.virtual import Mirror, find_mirrors, peaks_of
@@ -29,7 +39,7 @@ ON_PLANE = 0.3  # places this near a plane are stray echoes of it [m]
 OPACITY, THICKNESS = 0.98, 0.007
 SEARCH = SurfaceConfig(tolerance=0.05, min_area=0.5)
 OUTSIDE = 0.5  # how far beyond the receivers and what they see a site reaches, where mirrors alone are known [m]
-LEAST_TRUSTED = 8  # witnesses of a plane to which Gaussians are moved
+TRUSTED = 0.2  # share of a plane's surface that echoes must speak for, where Gaussians are moved to it
 APART = 0.25  # Gaussians from echoes complete those of photographs where none is this near [m]
 
 
@@ -55,20 +65,23 @@ def geometry_of_echoes(echoes: Echoes, *, seed: int = 0) -> Gaussians:
             f"{len(echoes)}. Give spectra at more positions, or check the transmitter"
         )
     spots = merged(echoes, SPOT)
+    return _with_planes(*_planes_of(echoes, spots, seed), spots)
+
+
+def _planes_of(echoes: Echoes, spots: Spots, seed: int) -> tuple[Planes, Patches]:
+    """The planes through echoes, which are merged in `spots`, and where they have surface."""
     rough = _flat(spots.points, spots.normals, SPOT)
-    surfaces = find_surfaces(rough, echoes.receivers, SurfaceConfig(**{**vars(SEARCH), "seed": seed}))
-    surfaces = consolidated(surfaces, rough.means)
+    surfaces = consolidated(find_surfaces(rough, echoes.receivers, replace(SEARCH, seed=seed)), rough.means)
     planes, _ = refined_by_echoes(surfaces.planes, surfaces.patches, echoes)
-    patches = filled(planes, _moved(surfaces.patches, surfaces.planes, planes), echoes)
-    return _with_planes(planes, patches, spots)
+    return planes, filled(planes, _moved(surfaces.patches, surfaces.planes, planes), echoes)
 
 
 def corrected(geometry: Gaussians, spectra: Spectrum, tx: Pose | None = None, *, seed: int = 0) -> Gaussians:
     """Gaussians of photographs, corrected by what echoes in `spectra` `[position, row, col]` tell.
 
-    Planes move to where their echoes lie, and what is near them and along them goes flat onto them; Gaussians off the
-    planes in places that waves were seen to cross are left out; surfaces that only echoes tell of are added. Raises
-    InputError for spectra without delay or departure.
+    Planes move to where their echoes lie, and what is near them and along them goes flat onto them. Other Gaussians are
+    left out in places that waves were seen to cross and behind what bounds the site. Surfaces that only echoes tell of
+    are added. With fewer than 100 echoes nothing changes. Raises InputError for spectra without delay or departure.
     """
     geometry = geometry.detach()
     echoes = echoes_of(spectra, _transmitter(spectra, tx).position)
@@ -76,10 +89,15 @@ def corrected(geometry: Gaussians, spectra: Spectrum, tx: Pose | None = None, *,
         return geometry
     surfaces = consolidated(find_surfaces(geometry, echoes.receivers, SurfaceConfig(seed=seed)), geometry.means)
     planes, witnesses = refined_by_echoes(surfaces.planes, surfaces.patches, echoes)
-    moved = flattened(geometry, surfaces, planes, witnesses >= LEAST_TRUSTED)
-    haze = (surfaces.plane_of < 0) & in_free_space(moved.means, echoes)
+    trusted = witnesses * REGION**2 > TRUSTED * surfaces.patches.areas
+    trusted &= witnesses >= LEAST_WITNESSES
+    moved = flattened(geometry, surfaces, planes, trusted)
+    spots = merged(echoes, SPOT)
+    walls, extents = _planes_of(echoes, spots, seed)
+    loose = ~torch.cat((trusted, trusted.new_zeros(1)))[surfaces.plane_of]  # -1, off the planes, is the last one
+    haze = loose & (in_free_space(moved.means, echoes) | behind(moved.means, walls, extents, echoes))
     kept = Gaussians(**{name: part[~haze] for name, part in moved.tensors().items()})
-    return completed_by(kept, geometry_of_echoes(echoes, seed=seed))
+    return completed_by(kept, _with_planes(walls, extents, spots))
 
 
 def completed_by(geometry: Gaussians, other: Gaussians) -> Gaussians:
