@@ -19,7 +19,7 @@ from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.surface import normals, sample_mesh
 from rf3dgs.training import corrected, geometry_from_spectra
-from rf3dgs.training.echo_planes import filled, in_free_space, refined_by_echoes
+from rf3dgs.training.echo_planes import behind, filled, in_free_space, refined_by_echoes
 from rf3dgs.training.echoes import Echoes, echoes_of, merged
 
 HIGH = torch.tensor([6.0, 5.0, 3.0])
@@ -171,6 +171,18 @@ def test_free_space_is_where_waves_went_and_nothing_answered():
     assert free.tolist() == [True, False, False, False]
 
 
+def test_behind_is_what_a_wall_hides_from_all_receivers():
+    echoes = echoes_of(single(), TX)
+    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) * HIGH
+    points[:, 0] = 6.0
+    outwards, across = torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[0.0, 1.0, 0.0]])
+    places = torch.tensor([[6.5, 2.5, 1.5], [5.5, 2.5, 1.5], [6.5, 9.0, 1.5]])
+    wall = Planes(outwards, torch.tensor([6.0]))
+    assert behind(places, wall, Patches.of(wall, [points]), echoes).tolist() == [True, False, False]
+    screen = Planes(across, torch.tensor([2.5]))  # with receivers on both sides
+    assert not bool(behind(places, screen, Patches.of(screen, [points.roll(1, 1)]), echoes).any())
+
+
 @pytest.fixture(scope="module")
 def from_radio() -> Gaussians:
     return geometry_from_spectra(single(astray_deg=0.3))
@@ -234,10 +246,12 @@ def test_corrected_geometry_has_its_walls_where_the_echoes_are():
     true = room(0.12, without=5)
     swollen = replace(true, means=0.5 * HIGH + (true.means - 0.5 * HIGH) * (1 + 0.16 / HIGH))  # each wall 8 cm out
     floaters = Gaussians.random(40, [2.0, 1.5, 1.2], [4.0, 3.5, 2.0], degree=1, seed=3)
-    floaters = replace(floaters, logit_opacities=torch.full((40,), 2.0))
-    found = corrected(Gaussians.join((swollen, floaters)), single(astray_deg=0.3))
+    beyond = Gaussians.random(40, [6.5, 1.0, 1.0], [7.5, 4.0, 2.0], degree=1, seed=4)
+    haze = replace(Gaussians.join((floaters, beyond)), logit_opacities=torch.full((80,), 2.0))
+    found = corrected(Gaussians.join((swollen, haze)), single(astray_deg=0.3))
     away = off_the_walls(found.means)
     assert float((away < 0.02).double().mean()) > 0.95
     assert int((away > 0.5).sum()) == 0
+    assert bool(((found.means > -0.1) & (found.means < HIGH + 0.1)).all())
     apart = torch.cdist(room(0.3).means, found.means).amin(-1)
     assert float((apart < 0.15).double().mean()) > 0.97

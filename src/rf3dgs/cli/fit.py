@@ -28,7 +28,7 @@ class FitGeometry:
     """Visual stage: Gaussians from photographs, from the mesh of a scene, from a floor plan, or from spectra."""
 
     dataset: tyro.conf.Positional[Path | None] = None
-    """A dataset folder, or a folder of photographs with poses (COLMAP, nerfstudio, Blender)."""
+    """A dataset folder, or a folder of photographs with poses (COLMAP, nerfstudio, Blender); a .ply with --spectra."""
     out: Path = Path("geometry.ply")
     """The 3DGS .ply to write."""
     poses: Literal["given", "sfm"] = "given"
@@ -41,8 +41,7 @@ class FitGeometry:
     plan: Path | None = None
     """Take the geometry from this floor plan (TOML or JSON) instead of photographs."""
     spectra: str | None = None
-    """Take the geometry from the training spectra of this dataset instead; with photographs, too, correct it by them.
-    """
+    """Take the geometry from the training spectra of this dataset; with photographs or a .ply, correct it by them."""
     mesh_count: int = 40_000
     """Gaussians on a mesh or a floor plan."""
     flatten: bool = False
@@ -55,7 +54,7 @@ class FitGeometry:
         """Fit, write the .ply, and drop the checkpoints."""
         from rf3dgs.data.formats.detect import read_photos
         from rf3dgs.data.sfm import poses_from_photos
-        from rf3dgs.splats.ply import write_ply
+        from rf3dgs.splats.ply import read_ply, write_ply
         from rf3dgs.training.radio_geometry import corrected, geometry_from_spectra
         from rf3dgs.training.visual import fit_geometry
 
@@ -72,6 +71,8 @@ class FitGeometry:
         spectra = None if self.spectra is None else spectra_of(self.spectra)
         if spectra is not None and self.dataset is None:
             geometry = geometry_from_spectra(spectra, seed=self.visual.seed)
+        elif spectra is not None and self.dataset is not None and self.dataset.suffix == ".ply":
+            geometry = corrected(read_ply(self.dataset), spectra, seed=self.visual.seed)
         elif self.mesh is not None:
             geometry = _from_mesh(self.mesh, self.mesh_count, self.visual.seed)
         elif self.plan is not None:
