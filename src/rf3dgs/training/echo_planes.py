@@ -19,6 +19,7 @@ REGION = 0.3  # echoes in one square of a plane of this size are one witness [m]
 LEAST_WITNESSES = 8
 STEPS = 12
 HULL, FULL = 5.0, 0.25  # planes of this much surface [m^2], which is this share of their hull, reach over the hull
+BOUND, STRAY = 2.0, 0.02  # surface of a plane that bounds the site [m^2], and share of what may be behind it
 FIRM = 5  # cells; narrower bits of a large plane's surface do not count for its hull
 GAP = 0.5  # of other planes, gaps up to twice this are closed [m]
 STEEP = 0.7  # cosine; planes less steep to each other have no edge
@@ -100,10 +101,13 @@ def filled(planes: Planes, patches: Patches, echoes: Echoes) -> Patches:
 
 
 def bounding(planes: Planes, patches: Patches, echoes: Echoes) -> list[int]:
-    """The large planes that receivers and transmitter have on one side of them, but for one in twenty."""
+    """The planes of some size behind which lie neither receivers nor transmitter nor, but for one in fifty, echoes."""
     ends = torch.cat((echoes.receivers, echoes.tx[None]))
-    ahead = (ends @ planes.normals.mT > planes.offsets).double().mean(0)
-    return torch.nonzero((patches.areas >= HULL) & ((ahead - 0.5).abs() > 0.45)).squeeze(-1).tolist()
+    ahead = ends @ planes.normals.mT - planes.offsets
+    side = ahead.mean(0).sign()
+    beyond = (echoes.points @ planes.normals.mT - planes.offsets) * side < -REACH
+    alone = ((ahead * side < 0).double().mean(0) <= STRAY) & (beyond.double().mean(0) <= STRAY)
+    return torch.nonzero((patches.areas >= BOUND) & alone).squeeze(-1).tolist()
 
 
 def behind(points: Tensor, planes: Planes, patches: Patches, echoes: Echoes) -> Tensor:
