@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FitGeometry:
-    """Visual stage: Gaussians from photographs, from the mesh of a scene, or from a floor plan."""
+    """Visual stage: Gaussians from photographs, from the mesh of a scene, from a floor plan, or from spectra."""
 
     dataset: tyro.conf.Positional[Path | None] = None
-    """A dataset folder, or a folder of photographs with poses (COLMAP, nerfstudio, Blender)."""
+    """A dataset folder, or a folder of photographs with poses (COLMAP, nerfstudio, Blender); a .ply with --spectra."""
     out: Path = Path("geometry.ply")
     """The 3DGS .ply to write."""
     poses: Literal["given", "sfm"] = "given"
@@ -40,6 +40,8 @@ class FitGeometry:
     """Take the geometry from this scene's mesh instead of photographs ("lobby", "box", an XML file)."""
     plan: Path | None = None
     """Take the geometry from this floor plan (TOML or JSON) instead of photographs."""
+    spectra: str | None = None
+    """Take the geometry from the training spectra of this dataset; with photographs or a .ply, correct it by them."""
     mesh_count: int = 40_000
     """Gaussians on a mesh or a floor plan."""
     flatten: bool = False
@@ -52,18 +54,26 @@ class FitGeometry:
         """Fit, write the .ply, and drop the checkpoints."""
         from rf3dgs.data.formats.detect import read_photos
         from rf3dgs.data.sfm import poses_from_photos
-        from rf3dgs.splats.ply import write_ply
+        from rf3dgs.splats.ply import read_ply, write_ply
+        from rf3dgs.training.radio_geometry import corrected, geometry_from_spectra
         from rf3dgs.training.visual import fit_geometry
 
         if self.out.is_dir():
             raise InputError(f"{self.out} is a folder; name the .ply file to write with --out")
         given = [name for name in ("dataset", "mesh", "plan") if getattr(self, name) is not None]
-        if ("mesh" in given and "plan" in given) or not given:
+        others = ("mesh" in given) + ("plan" in given) + (self.spectra is not None)
+        if others > 1 or not (given or self.spectra):
+            got = " and ".join([*given, *(["spectra"] if self.spectra else [])])
             raise InputError(
-                "geometry comes from a folder of photographs, from --mesh or from --plan; "
-                f"got {' and '.join(given) or 'none of them'}"
+                "geometry comes from a folder of photographs, from --mesh, from --plan or from --spectra; "
+                f"got {got or 'none of them'}"
             )
-        if self.mesh is not None:
+        spectra = None if self.spectra is None else spectra_of(self.spectra)
+        if spectra is not None and self.dataset is None:
+            geometry = geometry_from_spectra(spectra, seed=self.visual.seed)
+        elif spectra is not None and self.dataset is not None and self.dataset.suffix == ".ply":
+            geometry = corrected(read_ply(self.dataset), spectra, seed=self.visual.seed)
+        elif self.mesh is not None:
             geometry = _from_mesh(self.mesh, self.mesh_count, self.visual.seed)
         elif self.plan is not None:
             geometry = geometry_of_plan(self.plan, self.mesh_count, self.visual.seed)
@@ -83,6 +93,7 @@ class FitGeometry:
                 photos, visual, initial=found.points, progress=console(), checkpoint_dir=with_checkpoints
             )
             geometry = flat_on_planes(geometry, photos) if self.flatten else geometry
+            geometry = geometry if spectra is None else corrected(geometry, spectra, seed=self.visual.seed)
         write_ply(self.out, geometry)
         drop_checkpoints(self.out)
         out(f"{self.out}: {len(geometry):,} Gaussians")
@@ -227,6 +238,13 @@ def training_spectra(dataset: "Dataset") -> "Spectrum":
     except InputError as error:
         raise DataError(f"{dataset.path}/{SPECTRA}: {error}") from error
     return part.spectra
+
+
+def spectra_of(name: str) -> "Spectrum":
+    """The training spectra of the dataset that `name` is."""
+    from rf3dgs.cli.facts import open_dataset
+
+    return training_spectra(open_dataset(name))
 
 
 def check_world(geometry: "Gaussians", positions: "Tensor", source: str) -> None:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from rf3dgs.training.loop import train as train
     from rf3dgs.training.photographs import render_photo as render_photo
     from rf3dgs.training.radio import fit_radio as fit_radio
+    from rf3dgs.training.radio_geometry import corrected as corrected
+    from rf3dgs.training.radio_geometry import geometry_from_spectra as geometry_from_spectra
     from rf3dgs.training.refine import refine_field as refine_field
     from rf3dgs.training.uncertainty_fit import fit_uncertainty as fit_uncertainty
     from rf3dgs.training.visual import fit_geometry as fit_geometry
@@ -24,6 +26,8 @@ __all__ = [  # noqa: RUF022 (reading order)
     "VisualConfig",
     "fit_geometry",
     "render_photo",
+    "geometry_from_spectra",
+    "corrected",
     "RadioConfig",
     "fit_radio",
     "refine_field",
@@ -43,6 +47,8 @@ __getattr__, __dir__ = lazy_names(
         "VisualConfig": ".config",
         "fit_geometry": ".visual",
         "render_photo": ".photographs",
+        "geometry_from_spectra": ".radio_geometry",
+        "corrected": ".radio_geometry",
         "RadioConfig": ".config",
         "fit_radio": ".radio",
         "refine_field": ".refine",

@@ -182,7 +182,7 @@ def _lacking(shown: Tensor, one: LitView, unit: float, floor_db: float) -> Tenso
     level = (share, share * error.clamp(-FARTHEST_DB, FARTHEST_DB))
     if one.channels.shape[-1] == 1:
         return torch.stack(level, -1)
-    reached = share * (truth >= floor)
+    reached = share * (truth >= floor) * (one.channels[..., 0] > one.floor)
     known = one.channels / torch.where(truth > 0, one.channels[..., 0], 1.0)[..., None]
     late = known[..., 1].float() - shown[..., 1] / some
     turned = torch.nn.functional.normalize(known[..., 2:].float(), dim=-1, eps=1e-9) - shown[..., 2:5] / some[..., None]
