@@ -313,6 +313,7 @@ def test_a_variant_changes_the_settings_it_names():
     assert (config.line_of_sight, config.steps, config.train_opacity) == ("surface", 7, False)
     assert (config.seed, config.floor_db) == (3, -150.0)
     assert model_of("best=paper,preset=best").config(0, -150.0).steps == RadioConfig.best().steps
+    assert model_of("laws=mirror,without=lit+residual").config(0, -150.0).without == ("lit", "residual")
 
 
 @pytest.mark.parametrize(

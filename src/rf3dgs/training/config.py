@@ -20,6 +20,9 @@ class RadioConfig:
     mirror_order: int | None = None
     """Most reflections of the mirror images that are point sources beside the transmitter, 3 at most; None is 2 with
     the mirror model and 0, the line of sight alone, with the paper's."""
+    without: tuple[Literal["lit", "ambient", "residual", "visibility"], ...] = ()
+    """The mirror model alone: parts that are left out, to see what each brings; without visibility nothing casts a
+    shadow and every way is open."""
     uncertainty: bool = False
     """The mirror model alone: learn how far its levels may be off, by leaving training positions out in turn. It takes
     about three times as long as the rest."""

@@ -32,6 +32,7 @@ from rf3dgs.training.radio_stage import RadioStage
 from rf3dgs.training.radio_views import radio_views
 from rf3dgs.training.source_fit import fit_sources
 
+PARTS = ("lit", "ambient", "residual", "visibility")
 MANY = 150_000  # Gaussians beyond which their level of detail is worth its pass
 
 
@@ -57,6 +58,12 @@ def fit_radio(
         raise InputError(f"steps must be 0 (the closed-form start alone) or more; got {config.steps}")
     if config.uncertainty and config.model != "mirror":
         raise InputError('uncertainty belongs to the mirror model; choose model="mirror" or leave it out')
+    unknown = [name for name in config.without if name not in PARTS]
+    if unknown or (config.without and config.model != "mirror"):
+        raise InputError(
+            f"without names parts of the mirror model, {', '.join(PARTS)}; got {', '.join(config.without)} with the "
+            f"model {config.model!r}. Leave it out"
+        )
     geometry.check()
     check_spectra(spectra)
     given, geometry = len(geometry), _detail(geometry, spectra, config)
