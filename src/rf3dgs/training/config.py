@@ -206,7 +206,7 @@ class SourceConfig:
     largest: int = 6
     """Over how many of the largest planes ways of order 3 are tried."""
     planes: int = 40
-    """The largest planes that are mirrors; smaller ones only block."""
+    """At most so many planes are mirrors, first those that mirror to a receiver, then by size; others only block."""
     complete: bool = True
     """Whether mirrors that the geometry lacks are found where secondary peaks of the spectra meet."""
     refine: bool = True
