@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from benchmarks.quality.radiance import scenes
+from benchmarks.quality.radiance import data, scenes
 from benchmarks.quality.radiance.data import geometry_of
 from benchmarks.quality.radiance.scenes import MOVED, SITES, Setting, under_a_roof
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.propagation.sites.lobby import lobby
+from rf3dgs.propagation.sites.scene import SceneObject
 from rf3dgs.propagation.sites.shapes import box
 
 
@@ -55,6 +56,20 @@ def test_geometry_ends_where_the_site_says(monkeypatch, tmp_path):
     assert bool((means > 1.0 - edge).all())
     assert bool((means < torch.tensor([7.0, 6.0]) + edge).all())
     assert float(means[:, 0].max() - means[:, 0].min()) > 5.0
+
+
+def test_what_nobody_sees_takes_no_gaussians(monkeypatch, tmp_path):
+    whole = SITES["round-room"].make()
+    low, high = whole.bounds
+    hidden = SceneObject("cellar", *box((2.0, 2.0, -2.0), (4.0, 4.0, -1.0))[:2], "concrete", 0.6)
+    cellar = replace(whole, objects=(*whole.objects, hidden), bounds=((low[0], low[1], -3.0), high))
+    monkeypatch.setattr(data, "EYES", 8)
+    for around in (None, 9.0):
+        site = replace(SITES["round-room"], make=lambda: cellar, around=around)
+        monkeypatch.setitem(scenes.SITES, "round-room", site)
+        means = geometry_of("mesh", Setting("round-room", "realistic"), tmp_path / str(around), count=3000).means
+        assert bool((means[:, 2] < -0.5).any()) == (around is None)
+        assert bool((means[:, 2] > 2.9).any())
 
 
 def test_a_mesh_is_sampled_once(tmp_path, monkeypatch):

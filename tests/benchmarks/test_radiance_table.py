@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from benchmarks.quality.radiance import __main__ as command
-from benchmarks.quality.radiance import cells, compare, data
+from benchmarks.quality.radiance import aging, cells, compare, data
 from benchmarks.quality.radiance.checks import beats_baselines, reaches
 from benchmarks.quality.radiance.models import changed, model_of
 from benchmarks.quality.radiance.results import Place, Results
@@ -209,6 +209,26 @@ def test_a_model_may_be_trained_on_what_was_before_things_moved(words, tmp_path,
     assert command.main([*moved, "--trained", "lobby"]) == 2  # whose receivers are others
 
 
+def test_the_table_of_aging_shows_what_is_lost_and_what_new_spectra_bring(words, tmp_path, monkeypatch, capsys):
+    def traced(setting, folder, rx, config, progress):
+        return write_paths(tmp_path / f"{setting.name}.h5", rx.position, noise=9.0 * (setting.name == "lobby-moved"))
+
+    monkeypatch.setattr(data, "paths_of", traced)
+    monkeypatch.setattr(data.Setting, "receivers", lambda setting, count: Pose(receivers()))
+    corner = torch.tensor([[-1.0, -1, 0], [15, -1, 0], [15, 16, 0], [-1, 16, 0]])
+    write_ply(tmp_path / "floor.ply", sample_mesh(corner, torch.tensor([[0, 1, 2], [0, 2, 3]]), count=400))
+    own = ["--positions", "20", "--new", "10", "--geometry", str(tmp_path / "floor.ply")]
+    places = [word for word in words[4:] if word not in ("--positions", "10", "20")]
+    places = places[: places.index("--seeds")]
+    assert aging.main([*own, *places]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    rmse = {line[:42].rstrip(): float(line.split(" / ")[2]) for line in lines[1:12]}
+    assert len(rmse) == 11
+    assert rmse[f"{'nearest of before':34}     now"] > rmse[f"{'nearest of before':34}  before"]
+    assert rmse[f"{'mirror refined by 10 new':34}     now"] < rmse[f"{'mirror of before':34}     now"]
+    assert aging.main([*own, *places, "--model", "castle"]) == 2
+
+
 def test_other_settings_for_data_that_are_there_are_refused(words, capsys):
     assert command.main(words) == 0
     assert command.main([*words, "--buffer", "0.5"]) == 2
@@ -313,6 +333,7 @@ def test_a_variant_changes_the_settings_it_names():
     assert (config.line_of_sight, config.steps, config.train_opacity) == ("surface", 7, False)
     assert (config.seed, config.floor_db) == (3, -150.0)
     assert model_of("best=paper,preset=best").config(0, -150.0).steps == RadioConfig.best().steps
+    assert model_of("laws=mirror,without=lit+residual").config(0, -150.0).without == ("lit", "residual")
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ def test_mirrors_come_back_from_disk_and_give_the_same_rays(field, tmp_path):
         field.tx.position,
         field.frequency,
         floor,
-        Patches.of(floor, spots),
+        Patches.of(floor, spots, 0.2),
         sequences(2, 2),
         torch.tensor([[-3.0, -5.0, 1.0], [-6.0, 0.0, 0.0]]),
         level_db=0.5,
@@ -63,6 +63,7 @@ def test_mirrors_come_back_from_disk_and_give_the_same_rays(field, tmp_path):
     mirrors.save(tmp_path / "mirrors.field")
     loaded = load_field(tmp_path / "mirrors.field")
     assert torch.equal(loaded.plane_of, plane_of)
+    assert loaded.sources.patches.cell == 0.2
     before, after = mirrors.paths(HERE, parts="sources"), loaded.paths(HERE, parts="sources")
     assert int(before.valid.sum()) >= 3
     torch.testing.assert_close(before.delay, after.delay)

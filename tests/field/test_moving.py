@@ -15,7 +15,7 @@ from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.field.images import sequences
 from rf3dgs.field.io import load_field
 from rf3dgs.field.lit import LitSurface
-from rf3dgs.field.moving import moved_ambient
+from rf3dgs.field.moving import moved_ambient, with_images
 from rf3dgs.field.radiance import bounce
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.field.sources import PointSources
@@ -275,3 +275,16 @@ def test_places_that_cannot_be_are_refused(field, where, message):
 def test_mirrors_must_fit_the_planes(field):
     with pytest.raises(InputError, match=r"mirrors must be \[6\], one for each plane; got \[5\]"):
         replace(field.sources, mirrors=torch.ones(5, dtype=torch.bool))
+
+
+def test_planes_that_mirror_to_a_receiver_go_before_larger_ones():
+    planes = Planes(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]), torch.tensor([-9.0, -8.0, 0.0]))
+    steps, wide = torch.arange(0.05, 3.0, 0.1), torch.arange(60.0, 70.0, 0.1)
+    far = torch.cartesian_prod(wide, wide, torch.zeros(1))  # surface under nobody
+    points = [far - torch.tensor([0, 0, 9.0]), far - torch.tensor([0, 0, 8.0])]
+    patches = Patches.of(planes, [*points, torch.cartesian_prod(torch.zeros(1), steps, steps)])
+    row = torch.full((1, 3), -1)
+    sources = PointSources(HERE.position, 60e9, planes, patches, row, torch.zeros(3, 3))
+    probes = torch.tensor([[2.0, 2.0, 1.5], [3.0, 1.5, 1.2]])
+    found = with_images(sources, probes, order=1, planes=1, largest=1)
+    assert found.sequence[:, 0].tolist() == [-1, 2]

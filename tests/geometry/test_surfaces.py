@@ -76,6 +76,24 @@ def test_a_patch_holds_its_wall_and_nothing_beside_it(found: Surfaces) -> None:
     assert math.isclose(float(found.patches.areas[floor]), 19.0, rel_tol=0.15)  # 20 m^2 less the block's foot
 
 
+def test_a_street_of_large_gaussians_has_planes_too() -> None:
+    walls = sample_mesh(*box((0.0, 0.0, 0.0), (60.0, 40.0, 20.0), inwards=True), spacing=1.5)
+    eyes = torch.tensor([[10.0, 10.0, 1.5], [50.0, 30.0, 1.5], [30.0, 20.0, 10.0]])
+    found = find_surfaces(walls, eyes)
+    assert found.patches.cell > 0.4
+    assert len(found.planes) == found.segments == 6
+    areas = found.patches.areas.sort().values[[0, 4]]  # whole cells of half a metre reach over the walls' edges
+    torch.testing.assert_close(areas, torch.tensor([800.0, 2400.0]), rtol=0.12, atol=0)
+    back = Surfaces.from_tensors(found.tensors())
+    assert back.patches.cell == found.patches.cell
+
+
+def test_small_gaussians_keep_cells_of_ten_centimetres(found: Surfaces) -> None:
+    assert found.patches.cell == 0.1
+    old = {name: tensor for name, tensor in found.tensors().items() if name != "patch_cell"}
+    assert Surfaces.from_tensors(old).patches.cell == 0.1
+
+
 def test_a_cloud_without_planes_has_segments_only() -> None:
     cloud = Gaussians.random(300, (0, 0, 0), (5, 5, 5), seed=1)
     found = find_surfaces(cloud, EYES)

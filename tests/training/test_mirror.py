@@ -188,3 +188,26 @@ def test_the_configuration_says_how_many_reflections_are_followed(training):
     assert len(alone.sources) == 1
     with pytest.raises(InputError, match="order must be from 0 to 3; got 4"):
         fit_radio(room(), training, replace(MIRROR, mirror_order=4))
+
+
+@pytest.mark.parametrize("part", ["lit", "ambient", "residual"])
+def test_a_part_that_is_left_out_sends_nothing(training, part):
+    surface = fit_radio(room(), training[:4], replace(MIRROR, without=(part,))).surface
+    lit, ambient = surface.parts(torch.nn.functional.normalize(surface.means - training.pose.position[0], dim=-1))
+    there = {"lit": float(lit.max()), "ambient": float(ambient.max()), "residual": float(surface.level.abs().max())}
+    assert all(value > 1e-15 for name, value in there.items() if name != part)  # walls send 1e-10 or so
+    assert there[part] < 1e-25
+
+
+def test_without_visibility_nothing_casts_a_shadow(training):
+    blind = fit_radio(room(), training[:4], replace(MIRROR, without=("visibility",)))
+    assert float(blind.surface.visibility.min()) == 1.0
+    outside = Pose(torch.tensor([9.0, 2.0, 1.5]))
+    assert bool(blind.sees_transmitter(outside))
+
+
+def test_parts_that_do_not_exist_cannot_be_left_out(training):
+    with pytest.raises(InputError, match="without names parts of the mirror model"):
+        fit_radio(room(), training, replace(MIRROR, without=("walls",)))
+    with pytest.raises(InputError, match="with the model 'paper'"):
+        fit_radio(room(), training, RadioConfig(without=("lit",)))

@@ -17,12 +17,12 @@ from rf3dgs.field.sources import PointSources
 from rf3dgs.geometry import Patches, Planes, Surfaces
 from rf3dgs.propagation.room import shoebox
 from rf3dgs.spectra.scan import spectrum_of
-from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
 from rf3dgs.training.consolidation import surface_points
 from rf3dgs.training.radio_views import ruled
-from rf3dgs.training.reflection import fit_marks, fit_reflection, glints, silent_planes
+from rf3dgs.training.reflection import fit_marks, fit_reflection, glints, ray_powers, silent_planes
 from rf3dgs.training.source_fit import fit_sources
 from rf3dgs.training.timed_mirrors import timed_mirrors
 
@@ -205,6 +205,18 @@ def test_a_door_in_a_wall_is_marked():
 
 def test_marks_are_left_out_where_planes_are_uniform(fitted):
     assert fitted.sources.marks is None
+
+
+@pytest.mark.parametrize("over_db", [10.0, 40.0, 80.0])
+def test_powers_of_beams_are_right_however_far_they_stand_over_their_surroundings(over_db):
+    lobe = Instrument.gaussian(math.radians(4.0))
+    azimuth = torch.tensor([0.3, 0.3 + math.radians(6.0), 2.0])
+    arrival = torch.stack((azimuth.cos(), azimuth.sin(), torch.zeros(3)), -1)
+    grid, truth = equirect_grid(180, 90), 1e-10 * torch.tensor([1.0, 0.2, 0.01], dtype=torch.float64)
+    angle = angle_between(*torch.broadcast_tensors(grid.directions[:, :, None], arrival))
+    power = (lobe.kernel(angle).double() * truth).sum(-1) + 1e-10 * 10 ** (-over_db / 10)
+    found, _ = ray_powers(Spectrum(power, grid, Pose(torch.zeros(3)), 60e9, lobe, "ideal"), arrival)
+    torch.testing.assert_close(found, truth, rtol=0.02, atol=1e-13)  # float32 angles; the third is the haze at 10 dB
 
 
 def test_a_mirror_that_is_nowhere_seen_falls_silent(spectra):

@@ -19,21 +19,26 @@ from rf3dgs.channel.paths import Paths
 from rf3dgs.cli.chain import REPEAT_RAYS, REPEAT_SEED
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.files import write_whole
-from rf3dgs.core.grids import equirect_grid
+from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import equirect_grid, view_of
 from rf3dgs.core.progress import Console, Progress
 from rf3dgs.data.dataset import Dataset
 from rf3dgs.data.stream import stream_spectra
+from rf3dgs.field.lit import BLENDING
 from rf3dgs.propagation.config import TraceConfig
 from rf3dgs.spectra.codec import DbWindow, window_of
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.ply import read_ply, write_ply
-from rf3dgs.splats.surface import sample_mesh
+from rf3dgs.splats.rasterize import rasterize
+from rf3dgs.splats.surface import sample_faces, sample_mesh
 from rf3dgs.training.checkpoint import fingerprint
+from rf3dgs.training.lit_views import LEAST_WEIGHT
 
 GRID = (180, 90)
 RANGE_DB = 80.0  # between the window's ends
+EYES = 100  # receivers that say what of a large site matters
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +223,23 @@ def _from_mesh(setting: Setting, count: int) -> Gaussians:
         middle = vertices[faces].mean(1)[:, :2]
         near = ((middle > low - around) & (middle < high + around)).all(-1)
         faces, colours = faces[near], colours[near]
+        eyes = torch.cat((scene.tx.position[None], setting.receivers(EYES).position))
+        seen = _in_sight(vertices, faces, eyes, count)
+        faces, colours = faces[seen], colours[seen]
     return sample_mesh(vertices, faces, count=count, colours=colours)
+
+
+def _in_sight(vertices: Tensor, faces: Tensor, eyes: Tensor, count: int) -> Tensor:
+    """True `[face]` for faces of which one of `eyes` `[eye, 3]` sees a part; those too small for a Gaussian stay."""
+    gaussians, face = sample_faces(vertices, faces, count=count)
+    shape = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+    most = torch.zeros(len(gaussians))
+    for eye in eyes:
+        values = torch.zeros(len(gaussians), 1).requires_grad_()
+        drawn = rasterize(*shape, values, view_of(Pose(eye), equirect_grid(*GRID)), compositing=BLENDING)
+        most = torch.maximum(most, torch.autograd.grad(drawn.values.sum(), values)[0][:, 0])
+    held = torch.bincount(face, minlength=len(faces))
+    return (torch.bincount(face[most > LEAST_WEIGHT], minlength=len(faces)) > 0) | (held == 0)
 
 
 def geometry_digest(gaussians: Gaussians) -> str:

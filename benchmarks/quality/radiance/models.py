@@ -81,13 +81,19 @@ def model_of(text: str) -> Model:
 
 
 def changed(config: Any, changes: Mapping[str, Any]) -> Any:
-    """A configuration with some settings replaced; "part.setting" reaches into a configuration inside it."""
+    """A configuration with some settings replaced; "part.setting" reaches into a configuration inside it.
+
+    A setting that is several names takes "one+other".
+    """
     known = {item.name for item in fields(config)}
     for key, value in changes.items():
         head, _, tail = key.partition(".")
         if head not in known or (tail and not is_dataclass(getattr(config, head))):
             raise InputError(f"{type(config).__name__} has no setting {key!r}; it has {', '.join(sorted(known))}")
-        new = changed(getattr(config, head), {tail: value}) if tail else value
+        old = getattr(config, head)
+        if isinstance(old, tuple) and isinstance(value, str):
+            value = tuple(value.split("+"))
+        new = changed(old, {tail: value}) if tail else value
         config = replace(config, **{head: new})
     return config
 

@@ -81,7 +81,7 @@ class Site:
 
     preset: unless another is named. receivers: how many, of which `held` (test, region, validation, near) are held out
     with a `buffer` [m] round regions. roofed: receivers must be looked for outside buildings, which are not closed.
-    around: geometry is cut off so far [m] from where receivers may be.
+    around: geometry is cut off so far [m] from where receivers may be, and faces that nobody sees are left out.
     """
 
     make: Callable[[], Scene]
@@ -188,6 +188,6 @@ SITES: Mapping[str, Site] = {
     "lobby-moved": Site(_lobby_moved, "realistic"),
     "lobby-before": Site(lobby, "realistic"),
     "round-room": Site(_round_room, "realistic"),
-    "simple_street_canyon_with_cars": Site(_canyon, "28ghz", buffer=2.0),
+    "simple_street_canyon_with_cars": Site(_canyon, "28ghz", buffer=2.0, around=60.0),
     "munich": Site(_munich, "28ghz", buffer=3.0, roofed=True, around=80.0),
 }

@@ -127,11 +127,15 @@ def moved_sources(
 def with_images(sources: PointSources, probes: Tensor, *, order: int, planes: int, largest: int) -> PointSources:
     """The sources with all images up to `order` reflections that reach one of the `probes` `[n, 3]` over surface.
 
-    Mirrors are the largest `planes` planes of `sources.mirrors`; a third reflection is tried over the `largest` only.
+    Mirrors are at most `planes` planes of `sources.mirrors`, those that mirror the transmitter to a probe by themselves
+    first, and of these the largest; a third reflection is tried over the `largest` only.
     """
     areas = torch.ones(len(sources.planes)) if sources.patches is None else sources.patches.areas
     if sources.mirrors is not None:
         areas = torch.where(sources.mirrors, areas, -1.0)
+    if int((areas >= 0).sum()) > planes:
+        alone = replace(sources, sequence=sequences(len(areas), 1)).reaching(probes)[1:]
+        areas = torch.where(alone & (areas >= 0), areas + areas.max(), areas)
     chosen = areas.argsort(descending=True, stable=True)[:planes]
     chosen = chosen[areas[chosen] >= 0]
     rows = sequences(len(chosen), min(order, 2))

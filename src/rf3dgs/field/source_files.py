@@ -1,5 +1,6 @@
 """Point sources in a field's files: numbers for the description, tensors for the rest, and back."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,6 +20,7 @@ KINDS = {
     "patch_low": torch.float32,
     "patch_shape": torch.int64,
     "patch_cells": torch.bool,
+    "patch_cell": torch.float64,
     "mark_points": torch.float32,
     "mark_plane": torch.int16,
     "mark_level_db": torch.float32,
@@ -96,6 +98,8 @@ def sources_of(record: Any, tensors: Mapping[str, Tensor], frequency: float) -> 
             "patch_shape": (planes, 2),
             "patch_cells": None,
         }
+        if PREFIX + "patch_cell" in tensors:  # of before cells had other widths than 10 cm, fields have none
+            shapes |= {"patch_cell": (1,)}
     if marked:
         shapes |= {"mark_points": (marked, 3), "mark_plane": (marked,), "mark_level_db": (marked,)}
     if record.get("mirrors", False):  # of before transmitters could move, fields have none
@@ -108,6 +112,8 @@ def sources_of(record: Any, tensors: Mapping[str, Tensor], frequency: float) -> 
         sizes = patches.shape
         if bool((sizes < 1).any()) or int(sizes.double().prod(-1).sum()) != len(patches.cells):
             raise DataError(f"patches of {sizes.tolist()} cells do not fit {len(patches.cells)} cells")
+        if not 0 < patches.cell < math.inf:
+            raise DataError(f"cells of patches must have a width in metres; got {patches.cell}")
     marks = None
     if marked:
         plane = found["mark_plane"].long()

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from rf3dgs.field.images import HIGHEST_ORDER
 from rf3dgs.geometry import Patches
-from rf3dgs.geometry.patches import CELL
 
 NEAREST = 1e-6  # share of a leg below which an end lies on the plane itself
 SHORTEST = 1e-3  # m: nearer sources count as that far
@@ -74,7 +73,7 @@ class Reach:
         shape = patches.shape.numpy() + 4
         sizes = shape.prod(-1)
         joined = torch.cat(cells) if cells else patches.cells
-        axes, low = _doubles(patches.axes) / CELL, _doubles(patches.low) / CELL - 2.0
+        axes, low = _doubles(patches.axes) / patches.cell, _doubles(patches.low) / patches.cell - 2.0
         return cls(axes, low, shape - 1.0, shape[:, 1], sizes.cumsum() - sizes, joined.numpy())
 
     def holds(self, points: np.ndarray, plane: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from rf3dgs.geometry.config import SurfaceConfig
 from rf3dgs.geometry.normals import depth_all_round, mass, spread_views
-from rf3dgs.geometry.patches import CELL, Patches
+from rf3dgs.geometry.patches import Patches
 from rf3dgs.geometry.surfaces import Surfaces, find_surfaces
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.surface import normals as shortest_axes
@@ -145,7 +145,7 @@ def _coverage(patches: Patches, plane: int) -> tuple[float, float]:
     pad = 6
     wide = torch.nn.functional.pad(torch.from_numpy(grid), (pad, pad, pad, pad)).numpy()
     whole = binary_fill_holes(binary_closing(wide, iterations=pad - 1))
-    return float(grid.sum()) * CELL**2, float(grid.sum() / max(1, (whole | wide).sum()))  # type: ignore[union-attr]
+    return float(grid.sum()) * patches.cell**2, float(grid.sum() / max(1, (whole | wide).sum()))  # type: ignore[union-attr]
 
 
 def _floating(gaussians: Gaussians, surfaces: Surfaces, count: Tensor) -> Tensor:

@@ -8,14 +8,14 @@ from torch import Tensor
 
 from rf3dgs.core.frames import matrix_from_quaternion
 from rf3dgs.geometry.config import SurfaceConfig
-from rf3dgs.geometry.patches import CELL, Patches, footprints, plane_axes, widths
+from rf3dgs.geometry.patches import Patches, cell_for, footprints, plane_axes, widths
 from rf3dgs.geometry.planes import Planes
 from rf3dgs.splats.gaussians import Gaussians
 
 PART = 0.1  # smaller pieces of a plane are not part of it [m^2]
 BEND = 0.5  # largest sagitta of a patch, in tolerances
 BENT = 0.3  # and the share of the distances' variance that a bend must explain to count
-LARGEST_SPOT = 0.3  # [m]
+LARGEST_SPOT = 3.0  # [cell]
 EDGE_ON = 0.3  # cosine of 73 degrees
 
 
@@ -34,25 +34,26 @@ class Found:
 @dataclass(frozen=True, eq=False)
 class Cloud:
     """What the search knows of the Gaussians: points and normals `[gaussian, 3]`, mass `[gaussian]` [m^2] (0 for faint
-    ones), and points `[gaussian, spot, 3]` over their footprints.
+    ones), and points `[gaussian, spot, 3]` over their footprints. cell [m]: how wide the cells of its patches are.
     """
 
     points: Tensor
     normals: Tensor
     mass: Tensor
     spots: Tensor
+    cell: float
 
     @classmethod
     def of(cls, gaussians: Gaussians, normals: Tensor, mass: Tensor, config: SurfaceConfig) -> "Cloud":
         """The cloud of Gaussians with `normals` of either sign; very large ones count no more than most."""
-        axes = matrix_from_quaternion(gaussians.quats)
+        axes, cell = matrix_from_quaternion(gaussians.quats), cell_for(gaussians.scales)
         order = gaussians.log_scales.argsort(-1, descending=True)[:, :2]
         longer = axes.gather(-1, order[:, None].expand(-1, 3, -1))
-        scales = gaussians.scales.gather(-1, order).clamp_max(LARGEST_SPOT)
+        scales = gaussians.scales.gather(-1, order).clamp_max(LARGEST_SPOT * cell)
         spots = footprints(gaussians.means, longer, scales)
         opaque = gaussians.opacities >= config.min_opacity
         bounded = torch.where(opaque, mass.clamp_max(float(mass.quantile(0.98))), 0.0)
-        return cls(gaussians.means, normals, bounded, spots)
+        return cls(gaussians.means, normals, bounded, spots, cell)
 
     def lies(self, plane: Found) -> Tensor:
         """True `[gaussian]` within the tolerances of a plane; an angle above 90 degrees: all but edge-on ones."""
@@ -64,8 +65,11 @@ class Cloud:
 
     def area(self, normal: Tensor, chosen: Tensor) -> float:
         """The area [m^2] that the Gaussians `chosen` cover, seen along `normal`."""
-        plane = Planes(normal[None], torch.zeros(1))
-        return float(Patches.of(plane, [self.spots[chosen].flatten(0, 1)]).areas[0]) if bool(chosen.any()) else 0.0
+        return float(self.patch(normal, self.spots[chosen].flatten(0, 1)).areas[0]) if bool(chosen.any()) else 0.0
+
+    def patch(self, normal: Tensor, points: Tensor) -> Patches:
+        """The cells of `points` `[point, 3]`, seen along `normal`."""
+        return Patches.of(Planes(normal[None], torch.zeros(1)), [points], self.cell)
 
     def pieces(self, normal: Tensor, lies: Tensor, width: float = 0.0) -> tuple[Tensor, Tensor, float]:
         """Of the Gaussians `lies`, those in pieces of `PART` or more, those in the largest piece, and its area [m^2].
@@ -77,9 +81,9 @@ class Cloud:
         chosen = lies.nonzero().squeeze(-1)
         if not len(chosen):
             return lies, lies, 0.0
-        patch = Patches.of(Planes(normal[None], torch.zeros(1)), [self.spots[chosen].flatten(0, 1)])
+        patch = self.patch(normal, self.spots[chosen].flatten(0, 1))
         number = torch.from_numpy(label(patch.grid(0).numpy())[0]).long()  # type: ignore[index]
-        size = torch.bincount(number.flatten()) * CELL**2
+        size = torch.bincount(number.flatten()) * self.cell**2
         size[0] = 0.0
         cell = patch.cell_of(self.points[chosen], torch.zeros(len(chosen), dtype=torch.long))
         cell = torch.minimum(cell.clamp_min(0), patch.shape[0] - 1)
@@ -105,7 +109,7 @@ def fitted(points: Tensor, mass: Tensor, along: Tensor) -> tuple[Tensor, Tensor]
 def sharpness(cloud: Cloud, plane: Found, main: Tensor) -> float:
     """Mass of the Gaussians `main` over that of all with the same normal within 4 tolerances, above the same cells."""
     beside = cloud.lies(replace(plane, tolerance=4 * plane.tolerance))
-    patch = Patches.of(Planes(plane.normal[None], torch.zeros(1)), [cloud.points[main]])
+    patch = cloud.patch(plane.normal, cloud.points[main])
     beside[beside.clone()] = patch.holds(cloud.points[beside], torch.zeros(int(beside.sum()), dtype=torch.long))
     return float(cloud.mass[main].sum() / cloud.mass[beside | main].sum())
 

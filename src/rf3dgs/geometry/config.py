@@ -34,6 +34,6 @@ class SurfaceConfig:
     min_opacity: float = 0.3
     """Fainter Gaussians do not make surfaces; they still get a segment and, where they lie on a plane, the plane."""
     link: float = 0.25
-    """Gaussians off the planes join a segment of such neighbours within this distance [m]."""
+    """Gaussians off the planes join a segment of such neighbours within this distance [m], at cells of 10 cm."""
     link_angle_deg: float = 25.0
     """And this angle between their normals [deg]."""

@@ -60,9 +60,9 @@ def known_surfaces(
     first = [int((group == number).nonzero()[0]) for number in real]
     planes = Planes(normals[first].float().reshape(-1, 3), offsets[first].float())
     plane_of = place[group[face]]
-    spots = Cloud.of(gaussians, normals[face].float(), mass(gaussians), config).spots
-    spots = gaussians.means[:, None] + BETWEEN * (spots - gaussians.means[:, None])
-    patches = Patches.of(planes, [spots[plane_of == index].flatten(0, 1) for index in range(len(planes))])
+    cloud = Cloud.of(gaussians, normals[face].float(), mass(gaussians), config)
+    spots = gaussians.means[:, None] + BETWEEN * (cloud.spots - gaussians.means[:, None])
+    patches = Patches.of(planes, [spots[plane_of == index].flatten(0, 1) for index in range(len(planes))], cloud.cell)
     segment = torch.unique(labels[face] * (len(planes) + 1) + plane_of + 1, return_inverse=True)[1]
     return gaussians, Surfaces(planes, patches, plane_of, segment, normals[face].float())
 

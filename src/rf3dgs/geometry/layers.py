@@ -15,8 +15,7 @@ from torch import Tensor
 
 from rf3dgs.geometry.cloud import Cloud, Found, fitted
 from rf3dgs.geometry.config import SurfaceConfig
-from rf3dgs.geometry.patches import Patches, plane_axes
-from rf3dgs.geometry.planes import Planes
+from rf3dgs.geometry.patches import plane_axes
 
 REFINEMENTS = 4
 MOST_LAYERS = 8
@@ -74,7 +73,7 @@ def _is_layer(
         return False
     mass = float(cloud.mass[main].sum())
     wide = cloud.lies(replace(layer, tolerance=3 * layer.tolerance))
-    patch = Patches.of(Planes(layer.normal[None], torch.zeros(1)), [cloud.points[main]])
+    patch = cloud.patch(layer.normal, cloud.points[main])
     wide[wide.clone()] = patch.holds(cloud.points[wide], torch.zeros(int(wide.sum()), dtype=torch.long))
     centre = cloud.points[main].mean(0)
     for plane in found:

@@ -1,4 +1,4 @@
-"""Where planes have surface: occupied cells of 10 cm in each plane's own two axes."""
+"""Where planes have surface: occupied cells in each plane's own axes, 10 cm wide or more where Gaussians are large."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,8 @@ from torch import Tensor
 from rf3dgs.core.errors import InputError
 from rf3dgs.geometry.planes import Planes
 
-CELL = 0.10
+CELL = 0.10  # m
+CELL_OF_SIZE = 0.75  # cells per standard deviation, at least: wide enough for the spots of a Gaussian to touch
 REACH = 1.5  # standard deviations of a Gaussian that count as surface
 SPOTS = 5  # points along each axis of a Gaussian by which its cells are found
 MOST_CELLS = 50_000_000
@@ -18,42 +19,45 @@ MOST_CELLS = 50_000_000
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Occupancy of cells of `CELL` metres on each plane.
+    """Occupancy of square cells on each plane.
 
     axes `[plane, 2, 3]` are unit vectors in the plane, low `[plane, 2]` [m] the corner of the first cell along them,
     shape `[plane, 2]` the number of cells, cells `[cell]` the occupancy of all planes one after another, row by row.
+    cell [m] is the width of a cell.
     """
 
     axes: Tensor
     low: Tensor
     shape: Tensor
     cells: Tensor
+    cell: float = CELL
 
     @classmethod
-    def of(cls, planes: Planes, points: Sequence[Tensor]) -> "Patches":
-        """The cells that `points`, `[point, 3]` [m] for each plane, fall into."""
+    def of(cls, planes: Planes, points: Sequence[Tensor], cell: float = CELL) -> "Patches":
+        """The cells, `cell` [m] wide, that `points`, `[point, 3]` [m] for each plane, fall into."""
         axes = plane_axes(planes.normals)
         lows, shapes, cells = [], [], []
         for index, part in enumerate(points):
             local = part @ axes[index].mT
             if not len(local):
                 local = torch.zeros(1, 2)
-            low = (local.amin(0) / CELL).floor() * CELL
-            cell = ((local - low) / CELL + 1e-4).long()
-            rows, columns = (int(value) + 1 for value in cell.amax(0))
+            low = (local.amin(0) / cell).floor() * cell
+            place = ((local - low) / cell + 1e-4).long()
+            rows, columns = (int(value) + 1 for value in place.amax(0))
             if rows * columns > MOST_CELLS:
                 raise InputError(
-                    f"a plane reaches over {rows * CELL:.0f} m x {columns * CELL:.0f} m; expected a site in metres"
+                    f"a plane reaches over {rows * cell:.0f} m x {columns * cell:.0f} m; expected a site in metres"
                 )
             grid = torch.zeros(rows, columns, dtype=torch.bool)
             if len(part):
-                grid[cell[:, 0], cell[:, 1]] = True
+                grid[place[:, 0], place[:, 1]] = True
             lows.append(low)
             shapes.append(torch.tensor([rows, columns]))
             cells.append(grid.flatten())
         if not cells:
-            return cls(axes, torch.zeros(0, 2), torch.zeros(0, 2, dtype=torch.long), torch.zeros(0, dtype=torch.bool))
-        return cls(axes, torch.stack(lows), torch.stack(shapes), torch.cat(cells))
+            none = torch.zeros(0, 2)
+            return cls(axes, none, none.long(), torch.zeros(0, dtype=torch.bool), cell)
+        return cls(axes, torch.stack(lows), torch.stack(shapes), torch.cat(cells), cell)
 
     def __len__(self) -> int:
         return len(self.low)
@@ -61,7 +65,7 @@ class Patches:
     def holds(self, points: Tensor, plane: Tensor) -> Tensor:
         """True `[*batch]` where points `[*batch, 3]` [m], projected onto their `plane` `[*batch]`, lie on its surface.
 
-        Points up to a cell (10 cm) beside an occupied one count, so that gaps between Gaussians close. False for plane
+        Points up to a cell beside an occupied one count, so that gaps between Gaussians close. False for plane
         -1.
         """
         plane = torch.as_tensor(plane).expand(points.shape[:-1])
@@ -70,7 +74,7 @@ class Patches:
             return torch.zeros_like(known)
         index = plane.clamp_min(0)
         local = (self.axes[index].to(points.dtype) @ points[..., None]).squeeze(-1)
-        cell = ((local - self.low[index]) / CELL).floor().long()
+        cell = ((local - self.low[index]) / self.cell).floor().long()
         found = torch.zeros_like(known)
         for row in (-1, 0, 1):
             for column in (-1, 0, 1):
@@ -88,7 +92,7 @@ class Patches:
     def cell_of(self, points: Tensor, plane: Tensor) -> Tensor:
         """Row and column `[point, 2]` of points `[point, 3]` on their `plane` `[point]`; may lie outside the grid."""
         local = (self.axes[plane] @ points[..., None]).squeeze(-1)
-        return ((local - self.low[plane]) / CELL).floor().long()
+        return ((local - self.low[plane]) / self.cell).floor().long()
 
     def grid(self, plane: int) -> Tensor:
         """The cells of one plane `[row, column]`."""
@@ -99,16 +103,25 @@ class Patches:
     @property
     def areas(self) -> Tensor:
         """Occupied area `[plane]` [m^2]."""
-        return torch.tensor([float(self.grid(plane).sum()) * CELL**2 for plane in range(len(self))])
+        return torch.tensor([float(self.grid(plane).sum()) * self.cell**2 for plane in range(len(self))])
 
     def tensors(self) -> dict[str, Tensor]:
         """The tensors by name, for files."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        parts = {field.name: getattr(self, field.name) for field in fields(self)}
+        return parts | {"cell": torch.tensor([self.cell], dtype=torch.float64)}
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor]) -> "Patches":
-        """The patches of a mapping as `tensors()` gives it."""
-        return cls(**{field.name: tensors[field.name] for field in fields(cls)})
+        """The patches of a mapping as `tensors()` gives it; cells are 10 cm wide where it does not say."""
+        parts = {field.name: tensors[field.name] for field in fields(cls) if field.name != "cell"}
+        return cls(**parts, cell=float(tensors["cell"]) if "cell" in tensors else CELL)
+
+
+def cell_for(scales: Tensor) -> float:
+    """The width of cells [m] for Gaussians of `scales` `[gaussian, 3]` [m]: 10 cm, or wider where most are larger."""
+    if not len(scales):
+        return CELL
+    return max(CELL, CELL_OF_SIZE * float(scales.sort(-1).values[:, 1].median()))
 
 
 def plane_axes(normals: Tensor) -> Tensor:

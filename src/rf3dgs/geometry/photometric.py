@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
 from rf3dgs.core.grids import Camera
-from rf3dgs.geometry.patches import CELL, Patches
+from rf3dgs.geometry.patches import Patches
 from rf3dgs.geometry.planes import Planes
 from rf3dgs.splats.compositing import Compositing
 from rf3dgs.splats.draw import draw
@@ -107,7 +107,7 @@ def _refine(
     """The best plane near the given one by a coarse sweep of offsets and finer steps of offset and both tilts."""
     axes = patches.axes[plane]
     low = patches.low[plane]
-    low, high = low - MARGIN, low + patches.shape[plane] * CELL + MARGIN
+    low, high = low - MARGIN, low + patches.shape[plane] * patches.cell + MARGIN
     low, high = torch.maximum(low, (box @ axes.mT).amin(0)), torch.minimum(high, (box @ axes.mT).amax(0))
     middle = 0.5 * (low + high)
     low, high = torch.maximum(low, middle - LARGEST / 2), torch.minimum(high, middle + LARGEST / 2)

@@ -130,9 +130,9 @@ def settled(cloud: Cloud, found: Sequence[Found], config: SurfaceConfig) -> tupl
 def _by_area(cloud: Cloud, planes: Planes, plane_of: Tensor) -> tuple[Planes, Tensor, Patches]:
     """Planes by the area of their patches, without those on which nothing lies."""
     spots = [cloud.spots[plane_of == index].flatten(0, 1) for index in range(len(planes))]
-    areas = Patches.of(planes, spots).areas
+    areas = Patches.of(planes, spots, cloud.cell).areas
     order = [index for index in areas.argsort(descending=True, stable=True).tolist() if len(spots[index])]
     place = torch.full((len(planes) + 1,), -1)
     place[order] = torch.arange(len(order))
     planes = Planes(planes.normals[order], planes.offsets[order])
-    return planes, place[plane_of], Patches.of(planes, [spots[index] for index in order])
+    return planes, place[plane_of], Patches.of(planes, [spots[index] for index in order], cloud.cell)

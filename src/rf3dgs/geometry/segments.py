@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.geometry.config import SurfaceConfig
-from rf3dgs.geometry.patches import Patches
+from rf3dgs.geometry.patches import CELL, Patches
 
 SMALL = 12  # smaller pieces off the planes join the segment that most of their neighbours have
 
@@ -22,7 +22,7 @@ def segments_of(
     segment = _on_planes(points, plane_of, patches)
     free = plane_of < 0
     if bool(free.any()):
-        grown = _grown(points, normals, free, neighbours, config)
+        grown = _grown(points, normals, free, neighbours, config, config.link * patches.cell / CELL)
         segment = torch.where(free, int(segment.max()) + 1 + grown, segment)
     segment = torch.unique(segment, return_inverse=True)[1]
     segment = _joined(segment, free, neighbours)
@@ -48,13 +48,15 @@ def _on_planes(points: Tensor, plane_of: Tensor, patches: Patches) -> Tensor:
     return segment
 
 
-def _grown(points: Tensor, normals: Tensor, free: Tensor, neighbours: Tensor, config: SurfaceConfig) -> Tensor:
-    """Connected components `[gaussian]` among free Gaussians, linked by distance and angle."""
+def _grown(
+    points: Tensor, normals: Tensor, free: Tensor, neighbours: Tensor, config: SurfaceConfig, link: float
+) -> Tensor:
+    """Connected components `[gaussian]` among free Gaussians, linked by distance (at most `link` [m]) and angle."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     start = torch.arange(len(points))[:, None].expand_as(neighbours)
-    near = torch.linalg.vector_norm(points[neighbours] - points[:, None], dim=-1) < config.link
+    near = torch.linalg.vector_norm(points[neighbours] - points[:, None], dim=-1) < link
     alike = (normals[neighbours] * normals[:, None]).sum(-1) > math.cos(math.radians(config.link_angle_deg))
     linked = near & alike & free[neighbours] & free[:, None]
     rows, columns = start[linked].numpy(), neighbours[linked].numpy()

@@ -27,6 +27,9 @@ class RadioConfig:
     """Columns and rows of the spheres that pictures of an array are turned into; the field's lobe is 1.5 pixels."""
     array_rounds: int = 1
     """The mirror model alone: how often pictures of an array are explained anew by what the field predicts there."""
+    without: tuple[Literal["lit", "ambient", "residual", "visibility"], ...] = ()
+    """The mirror model alone: parts that are left out, to see what each brings; without visibility nothing casts a
+    shadow and every way is open."""
     uncertainty: bool = False
     """The mirror model alone: learn how far its levels may be off, by leaving training positions out in turn. It takes
     about three times as long as the rest."""
@@ -238,7 +241,7 @@ class SourceConfig:
     largest: int = 6
     """Over how many of the largest planes ways of order 3 are tried."""
     planes: int = 40
-    """The largest planes that are mirrors; smaller ones only block."""
+    """At most so many planes are mirrors, first those that mirror to a receiver, then by size; others only block."""
     complete: bool = True
     """Whether mirrors that the geometry lacks are found where secondary peaks of the spectra meet."""
     refine: bool = True

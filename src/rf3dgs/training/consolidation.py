@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from rf3dgs.geometry import Patches, Planes, Surfaces
-from rf3dgs.geometry.patches import CELL
 
 LARGE = 5.0  # m^2
 PIECE_ANGLE = 0.985  # cosine of 10 degrees
@@ -20,7 +19,7 @@ SKIN, SKIN_ANGLE = 0.30, 0.7  # m, cosine of 45 degrees
 def surface_points(planes: Planes, patches: Patches, plane: int) -> Tensor:
     """The middles `[n, 3]` [m] of the cells of one plane that are surface."""
     cell = torch.nonzero(patches.grid(plane))
-    local = patches.low[plane] + (cell + 0.5) * CELL
+    local = patches.low[plane] + (cell + 0.5) * patches.cell
     return local @ patches.axes[plane] + planes.offsets[plane] * planes.normals[plane]
 
 
@@ -47,7 +46,7 @@ def consolidated(surfaces: Surfaces, means: Tensor) -> Surfaces:
                 points[large] = torch.cat((points[large], points[piece] - height[:, None] * normal))
                 points[piece], whole[piece] = points[piece][:0], large
     plane_of = torch.where(surfaces.plane_of >= 0, whole[surfaces.plane_of.clamp_min(0)], -1)
-    joined = replace(surfaces, patches=Patches.of(planes, points), plane_of=plane_of)
+    joined = replace(surfaces, patches=Patches.of(planes, points, patches.cell), plane_of=plane_of)
     return replace(joined, plane_of=with_skins(joined, means))
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.geometry import Patches, Planes
-from rf3dgs.geometry.patches import CELL, plane_axes
+from rf3dgs.geometry.patches import plane_axes
 from rf3dgs.training.consolidation import surface_points
 from rf3dgs.training.echoes import Echoes
 
@@ -97,7 +97,7 @@ def filled(planes: Planes, patches: Patches, echoes: Echoes) -> Patches:
     for plane in 2 * numbers:  # twice, for edges with what has only now grown to its own
         edges = [_edge(planes, plane, other, points[other]) for other in numbers if other != plane]
         points[plane] = _closed(planes, patches, plane, edges)
-    return _opened(planes, patches, Patches.of(planes, points), echoes)
+    return _opened(planes, patches, Patches.of(planes, points, patches.cell), echoes)
 
 
 def bounding(planes: Planes, patches: Patches, echoes: Echoes) -> list[int]:
@@ -129,18 +129,20 @@ def _closed(planes: Planes, patches: Patches, plane: int, edges: Sequence[Tensor
     """
     from scipy.ndimage import binary_closing, binary_opening
 
-    margin = round(GAP / CELL)
+    margin = round(GAP / patches.cell)
     steps = torch.arange(-margin, margin + 1.0)
     disc = (torch.cartesian_prod(steps, steps).norm(dim=-1) <= margin).reshape(len(steps), -1).numpy()
     padded = torch.nn.functional.pad(patches.grid(plane), (margin,) * 4).numpy()
     cells = torch.nonzero(torch.from_numpy(binary_closing(padded, disc))) - margin
     if edges is not None and len(cells):
         firm = torch.nonzero(torch.from_numpy(binary_opening(padded, np.ones((FIRM, FIRM))))) - margin
-        reached = [((part @ patches.axes[plane].mT - patches.low[plane]) / CELL).floor().long() for part in edges]
+        reached = [
+            ((part @ patches.axes[plane].mT - patches.low[plane]) / patches.cell).floor().long() for part in edges
+        ]
         whole = _hull(torch.cat((firm if len(firm) else cells, *reached)))
         if edges or len(cells) >= FULL * len(whole):
             cells = torch.unique(torch.cat((cells, whole)), dim=0)
-    local = patches.low[plane] + (cells + 0.5) * CELL
+    local = patches.low[plane] + (cells + 0.5) * patches.cell
     return local @ patches.axes[plane] + planes.offsets[plane] * planes.normals[plane]
 
 
@@ -168,7 +170,7 @@ def _opened(planes: Planes, seen: Patches, whole: Patches, echoes: Echoes) -> Pa
         if len(cells) and bool(cross.any()):
             which = torch.zeros(int(cross.sum()), dtype=torch.long)
             places = start[cross] + share * (end[cross] - start[cross])
-            alone = Patches.of(Planes(normal[None], offset[None]), [cells])
+            alone = Patches.of(Planes(normal[None], offset[None]), [cells], whole.cell)
             cell = alone.cell_of(places, which)
             inside = ((cell >= 0) & (cell < alone.shape[0])).all(-1)
             count = torch.zeros(tuple(alone.shape[0].tolist()))
@@ -178,7 +180,7 @@ def _opened(planes: Planes, seen: Patches, whole: Patches, echoes: Echoes) -> Pa
             crossed = count[own[:, 0], own[:, 1]] > CROSSINGS - 0.5
             cells = cells[~crossed | seen.holds(cells, torch.full((len(cells),), plane))]
         points.append(cells)
-    return Patches.of(planes, points)
+    return Patches.of(planes, points, whole.cell)
 
 
 def legs_of(echoes: Echoes) -> tuple[Tensor, Tensor]:

@@ -22,7 +22,8 @@ SOFT_DB = 3.0  # where soft-L1 turns from squares to absolute values
 SHRINK = 30.0  # [pixel]
 LAW_SPREAD = torch.tensor([5.0, 1.0, 3.0, 5.0, 1.0])
 """How far a segment's law usually is from the common one: the unit in which it is drawn to it."""
-LAW_LOW = torch.tensor([-300.0, -6.0, 0.0, -300.0, -6.0])
+OFF_DB = -300.0  # the level of a part that is left out; so far down no step changes it
+LAW_LOW = torch.tensor([OFF_DB, -6.0, 0.0, OFF_DB, -6.0])
 LAW_HIGH = torch.tensor([100.0, 6.0, 60.0, 100.0, 6.0])
 STEPS = 12
 AMBIENT_ROUNDS = 3
@@ -57,8 +58,8 @@ class Scattering:
         return cls(means, normals, distance, cosine, mirrored, visibility, segment_of, cell_of, tx)
 
 
-def fit_laws(scattering: Scattering, seen: Observations) -> Tensor:
-    """The laws `[S, 5]` of all segments."""
+def fit_laws(scattering: Scattering, seen: Observations, without: Sequence[str] = ()) -> Tensor:
+    """The laws `[S, 5]` of all segments, "lit" or "ambient" part `without` which the rest is fitted."""
     chosen = _some(len(seen), MOST)
     g, weight = seen.gaussian[chosen], _worth(seen.weight[chosen])
     level = seen.level_db[chosen]
@@ -70,6 +71,8 @@ def fit_laws(scattering: Scattering, seen: Observations) -> Tensor:
     excess = (level - known.lit_db)[lit]
     first = float(excess.median()) if len(excess) else float(level.median()) + 20
     start = torch.tensor([[first, 0.0, 1.0, float(level.median()) - 6.0, 0.0]])
+    start[0, 0] = OFF_DB if "lit" in without else start[0, 0]
+    start[0, 3] = OFF_DB if "ambient" in without else start[0, 3]
     common = _refine(start, start, 0.0, everyone, known, level, weight)
     count = int(scattering.segment_of.max()) + 1
     return _refine(common.expand(count, -1).clone(), common, SHRINK, segment, known, level, weight)

@@ -24,7 +24,7 @@ from rf3dgs.training.lit_fit import Scattering, fit_ambient, fit_laws, refine_re
 from rf3dgs.training.lit_views import LitView, lit_views, observe
 from rf3dgs.training.source_fit import fit_sources
 
-CELL = 0.8  # m
+CELL = 8  # cells of the patches: 0.8 m unless Gaussians are large
 PASSES = 3
 MIRROR_ORDER = 2  # unless the configuration says otherwise
 DEEPEST_DB = 90.0  # under the window's ceiling; what is darker is the tail of a beam, or directions that no ray reached
@@ -50,7 +50,10 @@ def fit_mirror(
     positions = spectra.pose.position
     surfaces = find_surfaces(geometry, positions)
     progress.update(1)
-    obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, geometry.opacities, surfaces.plane_of)
+    solidity = geometry.opacities.detach()
+    if "visibility" in config.without:
+        solidity = torch.zeros_like(solidity)
+    obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, solidity, surfaces.plane_of)
     order = MIRROR_ORDER if config.mirror_order is None else config.mirror_order
     found = fit_sources(spectra, surfaces, obstacles, tx, SourceConfig(order=order, seed=config.seed))
     progress.update(2)
@@ -62,7 +65,7 @@ def fit_mirror(
         surface=surface,
         sources=found.sources,
         plane_of=found.plane_of,
-        solidity=geometry.opacities.detach(),
+        solidity=solidity,
         frequency=spectra.frequency,
         instrument=spectra.instrument,
         tx=tx,
@@ -85,13 +88,13 @@ def fit_surface(
 ) -> LitSurface:
     """The surface part of the model, fitted to `views`, in which point sources are already taken out."""
     visibility = visibility_of(obstacles, geometry.means, surfaces.normals, tx, surfaces.plane_of)
-    cells = cells_of(geometry.means, surfaces.segment_of)
+    cells = cells_of(geometry.means, surfaces.segment_of, CELL * surfaces.patches.cell)
     scattering = Scattering.of(geometry.means, surfaces.normals, visibility, surfaces.segment_of, cells, tx)
     seen = observe(geometry, views, unit=10 ** (window.ceil_db / 10), backend=config.backend)
     floor_db = _floored(window).floor_db
     seen = replace(seen, level_db=seen.level_db.clamp_min(floor_db))
     progress.update(3)
-    laws = fit_laws(scattering, seen)
+    laws = fit_laws(scattering, seen, config.without)
     progress.update(4)
     bare = LitSurface(
         means=geometry.means.detach(),
@@ -113,7 +116,8 @@ def fit_surface(
         tx=tx,
         window=window,
     )
-    surface = refine_residual(bare, views, passes=PASSES, floor_db=floor_db, backend=config.backend)
+    passes = 0 if "residual" in config.without else PASSES
+    surface = refine_residual(bare, views, passes=passes, floor_db=floor_db, backend=config.backend)
     progress.update(5)
     return surface
 
@@ -122,7 +126,7 @@ def _floored(window: DbWindow) -> DbWindow:
     return DbWindow(max(window.floor_db, window.ceil_db - DEEPEST_DB), window.ceil_db)
 
 
-def cells_of(means: Tensor, segment_of: Tensor) -> Tensor:
-    """The cell `[N]` of each Gaussian: a number, from 0 without gaps, for every cube of 0.8 m of every segment."""
-    key = torch.cat((torch.floor(means / CELL).long(), segment_of[:, None]), -1)
+def cells_of(means: Tensor, segment_of: Tensor, width: float) -> Tensor:
+    """The cell `[N]` of each Gaussian: numbers, from 0 without gaps, for cubes of `width` [m] of every segment."""
+    key = torch.cat((torch.floor(means / width).long(), segment_of[:, None]), -1)
     return torch.unique(key, dim=0, return_inverse=True)[1]

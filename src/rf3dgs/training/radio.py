@@ -35,6 +35,7 @@ from rf3dgs.training.radio_stage import RadioStage
 from rf3dgs.training.radio_views import radio_views
 from rf3dgs.training.source_fit import fit_sources
 
+PARTS = ("lit", "ambient", "residual", "visibility")
 MANY = 150_000  # Gaussians beyond which their level of detail is worth its pass
 
 
@@ -66,6 +67,12 @@ def fit_radio(
         )
     if config.uncertainty and config.model != "mirror":
         raise InputError('uncertainty belongs to the mirror model; choose model="mirror" or leave it out')
+    unknown = [name for name in config.without if name not in PARTS]
+    if unknown or (config.without and config.model != "mirror"):
+        raise InputError(
+            f"without names parts of the mirror model, {', '.join(PARTS)}; got {', '.join(config.without)} with the "
+            f"model {config.model!r}. Leave it out"
+        )
     geometry.check()
     check_spectra(spectra)
     pictures, spectra = _looked_through(spectra, config, progress)

@@ -121,7 +121,7 @@ def _transmitter(spectra: Spectrum, tx: Pose | None) -> Pose:
 def _with_planes(planes: Planes, patches: Patches, spots: Spots) -> Gaussians:
     """Gaussians in every cell of the planes, and on spots off the planes that several views saw."""
     cells, plane = cells_of(planes, patches)
-    walls = _flat(cells, planes.normals[plane], CELL)
+    walls = _flat(cells, planes.normals[plane], patches.cell)
     off = (owner_of(planes, patches, spots.points, ON_PLANE) < 0) & (spots.views >= LEAST_VIEWS)
     return Gaussians.join((walls, _flat(spots.points[off], spots.normals[off], SPOT)))
 
@@ -129,7 +129,7 @@ def _with_planes(planes: Planes, patches: Patches, spots: Spots) -> Gaussians:
 def _moved(patches: Patches, before: Planes, after: Planes) -> Patches:
     """The patches of planes that were moved: each cell goes along the normal."""
     cells, plane = cells_of(before, patches)
-    return Patches.of(after, [cells[plane == number] for number in range(len(after))])
+    return Patches.of(after, [cells[plane == number] for number in range(len(after))], patches.cell)
 
 
 def _flat(points: Tensor, normals: Tensor, spacing: float) -> Gaussians:

@@ -108,8 +108,9 @@ def ray_powers(one: Spectrum, arrival: Tensor) -> tuple[Tensor, Tensor]:
     base = ring[nearest]
     design = one.instrument.kernel(angle[:, pixel]).double().mT
     weight = 1 / (seen[pixel] + base).clamp_min(1e-30)
-    scale = ring.nan_to_num(0.0).clamp_min(1e-30)
-    matrix, target = design * weight[:, None] * scale, (seen[pixel] - base) * weight
+    matrix, target = design * weight[:, None], (seen[pixel] - base) * weight
+    size = torch.linalg.vector_norm(matrix, dim=0).clamp_min(1e-30)  # columns of size 1: the ridge asks no level
+    matrix = matrix / size
     free = known.clone()
     power = torch.zeros_like(ring)
     for _ in range(len(arrival)):
@@ -117,7 +118,7 @@ def ray_powers(one: Spectrum, arrival: Tensor) -> tuple[Tensor, Tensor]:
         normal = part.mT @ part + 1e-9 * torch.eye(part.shape[1], dtype=torch.float64)
         found = torch.linalg.solve(normal, part.mT @ target)
         power = torch.zeros_like(ring)
-        power[free] = found * scale[free]
+        power[free] = found / size[free]
         if bool((found >= 0).all()):
             break
         free = free & (power > 0)

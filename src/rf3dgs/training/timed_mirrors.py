@@ -85,12 +85,12 @@ def with_timed(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, Pa
             offsets.append(mirror.offset)
             points.append(torch.zeros(0, 3))
         taken.add(plane)
-        points[plane] = torch.cat((points[plane], discs(mirror)))
+        points[plane] = torch.cat((points[plane], discs(mirror, sources.patches.cell)))
     planes = Planes(torch.stack(normals), torch.stack(offsets))
     flat = [
         part - (part @ n - o)[:, None] * n for part, n, o in zip(points, planes.normals, planes.offsets, strict=True)
     ]
-    return planes, Patches.of(planes, flat)
+    return planes, Patches.of(planes, flat, sources.patches.cell)
 
 
 def _is_image_of_image(image: Tensor, tx: Tensor, mirrors: list[Mirror]) -> bool:

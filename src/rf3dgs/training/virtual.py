@@ -16,7 +16,6 @@ from rf3dgs.field.rays import Rays
 from rf3dgs.field.sources import PointSources
 from rf3dgs.field.transmitter import bearing_error, closest_point, pairwise_meetings, pixel_of
 from rf3dgs.geometry import Patches, Planes
-from rf3dgs.geometry.patches import CELL
 from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.obstacles import Obstacles
@@ -256,13 +255,13 @@ def with_mirrors(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, 
             normals.append(mirror.normal)
             offsets.append(mirror.offset)
             points.append(torch.zeros(0, 3))
-        points[place] = torch.cat((points[place], discs(mirror)))
+        points[place] = torch.cat((points[place], discs(mirror, sources.patches.cell)))
     planes = Planes(torch.stack(normals), torch.stack(offsets))
-    return planes, Patches.of(planes, points)
+    return planes, Patches.of(planes, points, sources.patches.cell)
 
 
-def discs(mirror: Mirror) -> Tensor:
-    """Points `[n, 3]` all over discs of surface around where a mirror was seen to reflect.
+def discs(mirror: Mirror, cell: float) -> Tensor:
+    """Points `[n, 3]`, a `cell` [m] apart, all over discs of surface around where a mirror was seen to reflect.
 
     Discs reach as far as the third nearest such place, so that sparse observations still close to one surface.
     """
@@ -271,7 +270,7 @@ def discs(mirror: Mirror) -> Tensor:
     axes = torch.stack((lean, torch.linalg.cross(mirror.normal, lean)))
     apart = torch.cdist(mirror.points, mirror.points).sort(-1).values
     reach = apart[:, min(3, len(apart) - 1)].clamp(*DISC)
-    steps = torch.arange(-round(DISC[1] / CELL), round(DISC[1] / CELL) + 1.0) * CELL
+    steps = torch.arange(-round(DISC[1] / cell), round(DISC[1] / cell) + 1.0) * cell
     spots = torch.cartesian_prod(steps, steps)
     inside = spots.norm(dim=-1) <= reach[:, None]
     return (mirror.points[:, None] + spots @ axes)[inside]
