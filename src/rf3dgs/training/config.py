@@ -20,9 +20,9 @@ class RadioConfig:
     mirror_order: int | None = None
     """Most reflections of the mirror images that are point sources beside the transmitter, 3 at most; None is 2 with
     the mirror model and 0, the line of sight alone, with the paper's."""
-    array_pictures: Literal["inverted", "face value"] = "inverted"
+    array_pictures: Literal["inverted", "face-value"] = "inverted"
     """Spectra taken by an array: "inverted" fits the waves behind the pictures, so that the field shows the ideal lobe;
-    "face value" takes the pictures for what is there, side lobes and all, as the paper does."""
+    "face-value" takes the pictures for what is there, side lobes and all, as the paper does."""
     array_grid: tuple[int, int] = (120, 60)
     """Columns and rows of the spheres that pictures of an array are turned into; the field's lobe is 1.5 pixels."""
     array_rounds: int = 1
@@ -126,7 +126,7 @@ PRESETS = {
     "paper": RadioConfig(
         model="paper",
         steps=10_000,
-        array_pictures="face value",
+        array_pictures="face-value",
         encoding="paper",
         line_of_sight="surface",
         start="grey",

@@ -182,7 +182,7 @@ def _looked_through(spectra: Spectrum, config: RadioConfig, progress: Progress) 
         spectra = replace(spectra, power=torch.where(spectra.looked, spectra.power, torch.zeros(())))
     if spectra.instrument.array is None:
         return None, spectra
-    if config.array_pictures == "face value":
+    if config.array_pictures == "face-value":
         return None, replace(spectra, instrument=replace(spectra.instrument, array=None))
     return spectra, ideal_targets(spectra, equirect_grid(*config.array_grid), progress=progress)
 
