@@ -205,7 +205,7 @@ class SourceConfig:
     planes: int = 40
     """The largest planes that are mirrors; smaller ones only block."""
     complete: bool = True
-    """Whether mirrors that the geometry lacks are found where secondary peaks of the spectra meet."""
+    """Whether walls that the geometry lacks, or has in a wrong place, are found from secondary peaks of the spectra."""
     refine: bool = True
     """Whether planes are moved, within what geometry allows, to where the peaks of their images are."""
     plane_error: float = 0.05

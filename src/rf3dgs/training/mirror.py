@@ -24,7 +24,7 @@ from rf3dgs.training.lit_fit import Scattering, fit_ambient, fit_laws, refine_re
 from rf3dgs.training.lit_views import LitView, lit_views, observe
 from rf3dgs.training.source_fit import fit_sources
 
-CELL = 0.8  # m
+CELL = 0.4  # m
 PASSES = 3
 MIRROR_ORDER = 2  # unless the configuration says otherwise
 DEEPEST_DB = 90.0  # under the window's ceiling; what is darker is the tail of a beam, or directions that no ray reached
@@ -123,6 +123,6 @@ def _floored(window: DbWindow) -> DbWindow:
 
 
 def cells_of(means: Tensor, segment_of: Tensor) -> Tensor:
-    """The cell `[N]` of each Gaussian: a number, from 0 without gaps, for every cube of 0.8 m of every segment."""
+    """The cell `[N]` of each Gaussian: a number, from 0 without gaps, for every cube of 0.4 m of every segment."""
     key = torch.cat((torch.floor(means / CELL).long(), segment_of[:, None]), -1)
     return torch.unique(key, dim=0, return_inverse=True)[1]
