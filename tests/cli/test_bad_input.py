@@ -443,6 +443,7 @@ IMPOSSIBLE = {
     "a place that is no number": ("render FIELD --at nan 7 1 --out OUT/s.png", "NaN or infinity"),
     "an infinite place": ("csi FIELD --at 7 inf 1", "NaN or infinity"),
     "too many pixels": ("render FIELD --at 7 7 1 --size 99999999 99999999 --out OUT/s.png", "at most 64 million"),
+    "a part of the paper's field": ("render FIELD --at 7 7 1 --part lit --out OUT/s.png", "belong to the mirror model"),
     "no pixels": ("render FIELD --at 7 7 1 --size 0 9 --out OUT/s.png", "at least one pixel"),
     "a field of view beyond a half turn": ("render FIELD --at 7 7 1 --fov-deg 200 --out OUT/s.png", "0 and 180"),
     "a format nobody writes": ("render FIELD --at 7 7 1 --out OUT/s.gif", ".png or .npz"),

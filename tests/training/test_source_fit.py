@@ -168,6 +168,37 @@ def test_a_wall_far_from_its_place_is_moved_into_it(spectra):
     assert missed(fit_sources(spectra, wrong, FREE, Pose(TX), SourceConfig(complete=False)).sources)[0] > 0.5
 
 
+def haze(count: int, opacity: float) -> Obstacles:
+    """Round Gaussians of 15 cm all over the room."""
+    generator = torch.Generator().manual_seed(5)
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4).contiguous()
+    means = torch.rand(count, 3, generator=generator) * SIZE
+    return Obstacles(means, quats, torch.full((count, 3), 0.15), torch.full((count,), opacity))
+
+
+def test_what_a_way_lets_pass_is_the_mean_of_its_legs(fitted):
+    here, obstacles = torch.tensor([6.5, 5.0, 1.2]), haze(150, 0.5)
+    rays, share = fitted.sources.candidates(here, obstacles)
+    assert set(rays.order.tolist()) == {0, 1, 2}
+    for ray in range(len(rays)):
+        legs = int(rays.order[ray]) + 1
+        stops = torch.cat((TX[None], rays.points[ray, : legs - 1], here[None]))
+        passed = obstacles.transmittance(stops[:-1], stops[1:])
+        # Both are float32; the product of three legs keeps six digits.
+        assert float(share[ray]) == pytest.approx(float(passed.double().prod() ** (1 / legs)), rel=1e-4, abs=1e-6)
+
+
+def test_the_gate_follows_reflections_that_shine_through_haze(spectra):
+    """Haze that darkens legs to a third does not close what the spectra show: nobody's sight and no reflection."""
+    clear = fit_sources(spectra, walls(), FREE, Pose(TX), SourceConfig(complete=False, order=1))
+    nothing = torch.full((120,), -1)
+    along = torch.eye(3)[:1].expand(120, 3)
+    hazy = replace(walls(), plane_of=nothing, segment_of=nothing, normals=along)
+    through = fit_sources(spectra, hazy, haze(120, 0.4), Pose(TX), SourceConfig(complete=False, order=1))
+    ways = [int(sum(len(one) for one in fit.rays)) for fit in (clear, through)]
+    assert ways[1] > 0.9 * ways[0]
+
+
 def test_points_rule_the_pixels_of_their_beams(fitted, spectra):
     for number in range(3):
         share, rule = ruled(spectra[number], fitted.rays[number])

@@ -243,7 +243,7 @@ class SourceConfig:
     planes: int = 40
     """At most so many planes are mirrors, first those that mirror to a receiver, then by size; others only block."""
     complete: bool = True
-    """Whether mirrors that the geometry lacks are found where secondary peaks of the spectra meet."""
+    """Whether walls that the geometry lacks, or has in a wrong place, are found from secondary peaks of the spectra."""
     refine: bool = True
     """Whether planes are moved, within what geometry allows, to where the peaks of their images are."""
     plane_error: float = 0.05

@@ -24,7 +24,7 @@ from rf3dgs.training.lit_fit import Scattering, fit_ambient, fit_laws, refine_re
 from rf3dgs.training.lit_views import LitView, lit_views, observe
 from rf3dgs.training.source_fit import fit_sources
 
-CELL = 8  # cells of the patches: 0.8 m unless Gaussians are large
+CELL = 4  # cells of the patches: 0.4 m unless Gaussians are large
 PASSES = 3
 MIRROR_ORDER = 2  # unless the configuration says otherwise
 DEEPEST_DB = 90.0  # under the window's ceiling; what is darker is the tail of a beam, or directions that no ray reached
