@@ -226,6 +226,7 @@ def test_the_table_of_aging_shows_what_is_lost_and_what_new_spectra_bring(words,
     assert len(rmse) == 11
     assert rmse[f"{'nearest of before':34}     now"] > rmse[f"{'nearest of before':34}  before"]
     assert rmse[f"{'mirror refined by 10 new':34}     now"] < rmse[f"{'mirror of before':34}     now"]
+    assert rmse[f"{'nearest of before and 10 new':34}     now"] < rmse[f"{'nearest of before':34}     now"]
     assert aging.main([*own, *places, "--model", "castle"]) == 2
 
 

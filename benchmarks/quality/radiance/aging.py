@@ -2,8 +2,8 @@
 
     python -m benchmarks.quality.radiance.aging --positions 40 --new 10 20
 
-A field and lookups are made of spectra from before, and judged where things have moved; then again with spectra of so
-many new positions. Geometry stays that from before. Other words are those of the table.
+A field and lookups are made of spectra from before, and judged where things have moved; then again with spectra of some
+of the positions measured anew. Geometry stays that from before. Other words are those of the table.
 docs/how-to/radiance-table.md has what came out.
 """
 
@@ -12,6 +12,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+
+import torch
 
 from benchmarks.quality.radiance.__main__ import Run, asked, say
 from benchmarks.quality.radiance.cells import Truth
@@ -24,6 +26,7 @@ from rf3dgs.field.radio_field import RadioField
 from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
 from rf3dgs.training.refine import refine_field
 
+SAME_PLACE = 1e-3  # m
 COLUMNS = ("peak_within_1", "beam_loss_eigen", "rmse_db", "path_gain", "delay", "departure")
 
 
@@ -58,11 +61,18 @@ def attempts(
             yield Attempt(f"{one.name} of before", judge, lambda one=one: stale(one))
     for some in new:
         count = len(some)
-        both = stack_spectra([part[index] for part in (before, some) for index in range(len(part))])
+        both = updated(before, some)
         yield Attempt(f"{model.name} refined by {count} new", "now", lambda some=some: refined(some))
         for one in (model, *lookups):
             yield Attempt(f"{one.name} of {count} new", "now", lambda one=one, some=some: made(one, some))
             yield Attempt(f"{one.name} of before and {count} new", "now", lambda one=one, both=both: made(one, both))
+
+
+def updated(before: Spectrum, new: Spectrum) -> Spectrum:
+    """Spectra from before with those of `new`, which take the place of what was measured there before."""
+    apart = torch.cdist(before.pose.position.double(), new.pose.position.double()).amin(1)
+    kept = before[apart > SAME_PLACE]
+    return stack_spectra([part[index] for part in (kept, new) for index in range(len(part))])
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -70,7 +80,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--scene", choices=BEFORE, default="lobby-moved")
     parser.add_argument("--model", default="mirror", help="a field, or NAME=BASE,SETTING=VALUE")
     parser.add_argument("--positions", type=int, default=40, help="training positions from before")
-    parser.add_argument("--new", nargs="+", type=int, default=[10, 20], help="training positions after")
+    parser.add_argument("--new", nargs="+", type=int, default=[10, 20], help="how many of them are measured anew")
     parser.add_argument("--seed", type=int, default=0)
     own, rest = parser.parse_known_args(words)
     try:
@@ -90,7 +100,7 @@ def main(words: Sequence[str] | None = None) -> int:
             for judge, data in judges.items()
             for holdout in wish.holdout
         }
-        print(f"{'':34}{'judged':>8}{'CPU [s]':>9}  " + "   ".join(wish.holdout))
+        print(f"{'':34}{'judged':>8}{'CPU [s]':>9}  " + "   ".join(wish.holdout), flush=True)
         for one in attempts(model_of(own.model), then.training(own.positions, seed), new, made):
             start = time.process_time()
             predictor = one.make()
