@@ -102,7 +102,7 @@ class Demo:
         train = dataset.train.spectra
         assert train is not None
         with clock.stage("radio stage"):
-            config = replace(radio, seed=radio.seed + self.seed)
+            config = replace(radio, seed=radio.seed + self.seed, geometry="given" if from_mesh else radio.geometry)
             trained = fit_radio(geometry, train, config, progress=progress, checkpoint_dir=folder / "radio")
             trained.save(field_path)
         with clock.stage("evaluation"):

@@ -159,6 +159,8 @@ class Fit:
         from rf3dgs.training.visual import fit_geometry
 
         radio = chosen_radio(self.preset, self.radio)
+        if self.mesh is not None:  # which is known, so that spectra have nothing to correct
+            radio = replace(radio, geometry="given")
         dataset = reduced(open_dataset(self.dataset), self.fraction)
         check_output(self.out)
         training_spectra(dataset)

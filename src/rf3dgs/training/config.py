@@ -17,6 +17,10 @@ class RadioConfig:
     model: Literal["mirror", "paper"] = "mirror"
     """"mirror": the transmitter's mirror images as point sources, and surfaces that scatter by laws of their own;
     "paper": harmonics in a dB window on every Gaussian, the line of sight as a point source."""
+    geometry: Literal["corrected", "given"] = "corrected"
+    """The mirror model alone: "corrected" moves walls to where waves that bounced once say they are, leaves out what
+    waves crossed and adds what only they know, if the spectra have delay and departure; "given" takes the Gaussians
+    as they are, such as those of a mesh that is known."""
     mirror_order: int | None = None
     """Most reflections of the mirror images that are point sources beside the transmitter, 3 at most; None is 2 with
     the mirror model and 0, the line of sight alone, with the paper's."""

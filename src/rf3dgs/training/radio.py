@@ -31,6 +31,7 @@ from rf3dgs.training.checkpoint import fingerprint
 from rf3dgs.training.config import RadioConfig, SourceConfig
 from rf3dgs.training.loop import train
 from rf3dgs.training.mirror import fit_mirror
+from rf3dgs.training.radio_geometry import corrected
 from rf3dgs.training.radio_stage import RadioStage
 from rf3dgs.training.radio_views import radio_views
 from rf3dgs.training.source_fit import fit_sources
@@ -80,6 +81,9 @@ def fit_radio(
     where = spectra.tx if tx is None else tx
     estimated = where is None
     where = estimate_transmitter(spectra) if where is None else where
+    timed = spectra.delay is not None and spectra.aod is not None
+    if timed and config.model == "mirror" and config.geometry == "corrected":
+        geometry = corrected(geometry, spectra, where, seed=config.seed)
     window = _window(spectra, config)
     meta: dict[str, str | int | float | bool] = {
         "model": config.model,
