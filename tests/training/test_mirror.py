@@ -199,6 +199,11 @@ def test_a_part_that_is_left_out_sends_nothing(training, part):
     assert there[part] < 1e-25
 
 
+def test_point_sources_may_be_left_alone(training):
+    field = fit_radio(room(), training[:4], replace(MIRROR, without=("lit", "ambient", "residual")))
+    assert float(field.without_sources().render(training.pose[0], training.grid, csi=False).power.max()) < 1e-25
+
+
 def test_without_visibility_nothing_casts_a_shadow(training):
     blind = fit_radio(room(), training[:4], replace(MIRROR, without=("visibility",)))
     assert float(blind.surface.visibility.min()) == 1.0

@@ -73,8 +73,10 @@ def fit_laws(scattering: Scattering, seen: Observations, without: Sequence[str] 
     start = torch.tensor([[first, 0.0, 1.0, float(level.median()) - 6.0, 0.0]])
     start[0, 0] = OFF_DB if "lit" in without else start[0, 0]
     start[0, 3] = OFF_DB if "ambient" in without else start[0, 3]
-    common = _refine(start, start, 0.0, everyone, known, level, weight)
     count = int(scattering.segment_of.max()) + 1
+    if "lit" in without and "ambient" in without:
+        return start.expand(count, -1).clone()
+    common = _refine(start, start, 0.0, everyone, known, level, weight)
     return _refine(common.expand(count, -1).clone(), common, SHRINK, segment, known, level, weight)
 
 
