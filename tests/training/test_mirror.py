@@ -215,4 +215,4 @@ def test_parts_that_do_not_exist_cannot_be_left_out(training):
     with pytest.raises(InputError, match="without names parts of the mirror model"):
         fit_radio(room(), training, replace(MIRROR, without=("walls",)))
     with pytest.raises(InputError, match="with the model 'paper'"):
-        fit_radio(room(), training, RadioConfig(without=("lit",)))
+        fit_radio(room(), training, RadioConfig(model="paper", without=("lit",)))
