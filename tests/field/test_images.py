@@ -179,7 +179,7 @@ def test_a_plane_that_a_leg_ends_on_does_not_stand_in_its_way():
     corners = torch.tensor([[-1.0, -1.0, 0.0], [9.0, -1.0, 0.0], [9.0, 9.0, 0.0], [-1.0, 9.0, 0.0]])
     thick = sample_mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), spacing=0.3, thickness=0.15)
     floor = Planes(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1))
-    sources = PointSources(TX, FREQUENCY, floor, None, sequences(1, 1), torch.zeros(1, 3))
+    sources = PointSources(TX, FREQUENCY, floor, None, sequences(1, 1), torch.zeros(1, 3), open_above=0.2)
     here = torch.tensor([4.0, 3.0, 1.4])
     shape = (thick.means, thick.quats, thick.scales, thick.opacities)
     assert sources.rays(here, Obstacles(*shape)).order.tolist() == [0]
