@@ -22,7 +22,7 @@ from rf3dgs.training.joint_views import JointView, joint_views, misfit
 from rf3dgs.training.lit_fit import BAND, CSI_RIDGE, LAW_HIGH, LAW_LOW, LAW_SPREAD, RIDGE, SHRINK, SOFT_DB
 from rf3dgs.training.lit_views import SOFT_NS, SOFT_TURN
 
-RATE = 0.02  # Adam's first step, in units of `SCALES`; it falls to zero
+RATE = 0.06  # Adam's first step, in units of `SCALES`; it falls to zero
 CSI_UNIT = torch.tensor([SOFT_NS, SOFT_TURN, SOFT_TURN, SOFT_TURN])
 SCALES = {
     "laws": LAW_SPREAD,
@@ -32,10 +32,11 @@ SCALES = {
     "segment_csi": CSI_UNIT / (C0 * (1 + BAND[:CSI_HARMONICS, None])),
     "cell_csi": CSI_UNIT / (C0 * (1 + BAND[:CSI_HARMONICS, None])),
     "own_csi": CSI_UNIT,
-    "reflection": torch.tensor([3.0, 3.0, 3.0]),
-    "level_db": torch.ones(()),
+    "reflection": torch.tensor([0.3, 0.3, 0.3]),
+    "level_db": torch.tensor(0.03),
 }
-"""What moves, and by how much one of it counts 1: dB, ns, radians, and what the laws of segments vary by."""
+"""What moves, and by how much one of it counts 1: dB, ns, radians, and what the laws of segments vary by. Point sources
+move a little only: peaks that stand alone tell them better than pixels that they share with the surface."""
 PRIOR = {
     "laws": SHRINK * SOFT_DB,
     "segment_sh": RIDGE.segment,

@@ -55,7 +55,7 @@ class JointView:
 def joint_views(
     spectra: Spectrum, sources: PointSources, rays: Sequence[Rays], *, unit: float, floor_db: float
 ) -> list[JointView]:
-    """The views of `spectra` `[position, row, col]`, reached by `rays` of `sources`; what is under `floor_db` is one."""
+    """The views of `spectra` `[position, row, col]` with the `rays` of `sources`; what is under `floor_db` is one."""
     return [_view(spectra[number], sources, one, unit, floor_db) for number, one in enumerate(rays)]
 
 
