@@ -34,6 +34,8 @@ class RadioConfig:
     without: tuple[Literal["lit", "ambient", "residual", "visibility"], ...] = ()
     """The mirror model alone: parts that are left out, to see what each brings; without visibility nothing casts a
     shadow and every way is open."""
+    joint: int = 0
+    """The mirror model alone: steps of joint refinement after the closed form, each on one training position."""
     uncertainty: bool = False
     """The mirror model alone: learn how far its levels may be off, by leaving training positions out in turn. It takes
     about three times as long as the rest."""

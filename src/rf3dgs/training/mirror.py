@@ -1,7 +1,8 @@
 """The mirror model's radio stage: spectra and frozen geometry to a `RadioField` whose parts are laws of physics.
 
-Closed form throughout: surfaces of the geometry, point sources (the transmitter and its mirror images), and then the
-surface part on what the point sources leave over. The same spectra and geometry give the same field.
+Closed form: surfaces of the geometry, point sources (the transmitter and its mirror images), and then the surface part
+on what the point sources leave over; if it is asked for, both are then refined together. The same spectra and geometry
+give the same field.
 """
 
 from dataclasses import replace
@@ -20,6 +21,7 @@ from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles, visibility_of
 from rf3dgs.training.config import RadioConfig, SourceConfig
 from rf3dgs.training.explain import explained
+from rf3dgs.training.joint import refine_jointly
 from rf3dgs.training.lit_fit import Scattering, fit_ambient, fit_laws, refine_residual
 from rf3dgs.training.lit_views import LitView, lit_views, observe
 from rf3dgs.training.source_fit import fit_sources
@@ -59,11 +61,25 @@ def fit_mirror(
     progress.update(2)
     views = lit_views(spectra, found.rays)
     surface = fit_surface(geometry, surfaces, obstacles, views, tx.position, window, config, progress)
-    parts = explained(surface, found.rays, spectra, _floored(window), config.backend)
+    sources, rays = found.sources, found.rays
+    if config.joint:
+        surface, sources = refine_jointly(
+            surface,
+            sources,
+            rays,
+            spectra,
+            steps=config.joint,
+            seed=config.seed,
+            floor_db=_floored(window).floor_db,
+            residual="residual" not in config.without,
+            backend=config.backend,
+        )
+        rays = sources.rays_each(positions, replace(obstacles, labels=found.plane_of), in_sight=found.seen)
+    parts = explained(surface, rays, spectra, _floored(window), config.backend)
     progress.finish()
     return RadioField(
         surface=surface,
-        sources=found.sources,
+        sources=sources,
         plane_of=found.plane_of,
         solidity=solidity,
         frequency=spectra.frequency,

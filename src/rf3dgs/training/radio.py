@@ -68,6 +68,11 @@ def fit_radio(
         )
     if config.uncertainty and config.model != "mirror":
         raise InputError('uncertainty belongs to the mirror model; choose model="mirror" or leave it out')
+    if config.joint < 0 or (config.joint and config.model != "mirror"):
+        raise InputError(
+            f"joint counts steps of the mirror model's joint refinement, 0 or more; got {config.joint} with the model "
+            f"{config.model!r}. Leave it out"
+        )
     unknown = [name for name in config.without if name not in PARTS]
     if unknown or (config.without and config.model != "mirror"):
         raise InputError(

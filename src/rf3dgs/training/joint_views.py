@@ -1,0 +1,115 @@
+"""What joint refinement looks at: training spectra as they were measured, the rays that reach them, and how far a
+picture of both is off."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from rf3dgs.core.grids import View, view_of
+from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
+from rf3dgs.field.radiance import NANOSECOND
+from rf3dgs.field.rays import Rays
+from rf3dgs.field.sources import PointSources
+from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.training.lit_fit import SOFT_DB
+from rf3dgs.training.lit_views import SOFT_NS, SOFT_TURN
+
+LEAST_SHARE = 1e-3  # of the floor; where something was measured a picture counts as no less
+
+
+@dataclass(frozen=True, eq=False)
+class JointView:
+    """One training spectrum as it was measured, and what reaches it from point sources.
+
+    view: what it shows. worth `[row, col]`: solid angle of a pixel relative to the picture's mean, zero where nothing
+    was measured. truth `[row, col, 1 (+ 4)]`: power over the surface's unit, delay [ns] and departure. floor
+    `[row, col]`: power over the unit up to which levels are all one.
+    place, ray, kernel `[n]`: which pixel sees which of k rays through how much of the beam. free `[k]`: power over the
+    unit in free space. plane, cosine, mark_db `[k, 3]`: its reflections; beyond the last plane is how many there are.
+    known `[k, 1 (+ 4)]`: 1, delay [ns] and departure.
+    """
+
+    view: View
+    worth: Tensor
+    truth: Tensor
+    floor: Tensor
+    place: Tensor
+    ray: Tensor
+    kernel: Tensor
+    free: Tensor
+    plane: Tensor
+    cosine: Tensor
+    mark_db: Tensor
+    known: Tensor
+
+    @property
+    def has_csi(self) -> bool:
+        """Whether delay and departure are known."""
+        return self.truth.shape[-1] > 1
+
+
+def joint_views(
+    spectra: Spectrum, sources: PointSources, rays: Sequence[Rays], *, unit: float, floor_db: float
+) -> list[JointView]:
+    """The views of `spectra` `[position, row, col]` with the `rays` of `sources`; what is under `floor_db` is one."""
+    return [_view(spectra[number], sources, one, unit, floor_db) for number, one in enumerate(rays)]
+
+
+def _view(one: Spectrum, sources: PointSources, rays: Rays, unit: float, floor_db: float) -> JointView:
+    floor = torch.zeros_like(one.power) if one.floor is None else torch.where(one.looked, one.floor, torch.zeros(()))
+    told = one.looked & ((one.power > 0) | (floor > 0))
+    truth = (one.power / unit)[..., None]
+    known = torch.ones(len(rays), 1)
+    if one.delay is not None and one.aod is not None:
+        truth = torch.cat((truth, one.delay[..., None] / NANOSECOND, one.aod), -1)
+        known = torch.cat((known, rays.delay[:, None] / NANOSECOND, rays.departure), -1)
+    place, ray, kernel = replace(rays, power=torch.ones_like(rays.power)).shares(one.pose, one.grid, one.instrument)
+    plane = sources.sequence[rays.index]
+    stops = torch.cat((sources.tx.expand(len(rays), 1, 3), rays.points[:, :-1]), 1)
+    normals = torch.cat((sources.planes.normals, torch.zeros(1, 3)))[plane]
+    cosine = (normalize(rays.points - stops, dim=-1) * normals).sum(-1).abs()
+    mark_db = torch.zeros(plane.shape)
+    if sources.marks is not None:
+        met = plane >= 0
+        marked = sources.marks.at(rays.points[met].double().numpy(), plane[met].numpy())
+        mark_db[met] = torch.from_numpy(np.asarray(marked, dtype=np.float32))
+    return JointView(
+        view=view_of(one.pose, one.grid),
+        worth=one.grid.solid_angle / one.grid.solid_angle.mean() * told,
+        truth=truth,
+        floor=(floor / unit).clamp_min(10 ** (floor_db / 10) / unit),
+        place=place,
+        ray=ray,
+        kernel=kernel,
+        free=friis_gain(rays.delay * SPEED_OF_LIGHT, sources.frequency) / unit,
+        plane=torch.where(plane >= 0, plane, len(sources.planes)),
+        cosine=cosine,
+        mark_db=mark_db,
+        known=known,
+    )
+
+
+def misfit(shown: Tensor, one: JointView) -> Tensor:
+    """How far a picture is off, a sum over pixels: of level errors in dB, and of those of delay and departure."""
+    level, truth = shown[..., 0], one.truth[..., 0]
+    above = truth > one.floor
+    least = torch.where(above, LEAST_SHARE * one.floor, one.floor)
+    error = 10 * torch.log10(level.clamp_min(least) / truth.clamp_min(one.floor))
+    cost = SOFT_DB**2 * _soft((error / SOFT_DB).square())
+    if one.has_csi:
+        hit = above & (level.detach() > 0)
+        some = torch.where(hit, level, 1.0)
+        late = shown[..., 1] / some - one.truth[..., 1]
+        turned = normalize(shown[..., 2:] / some[..., None], dim=-1, eps=1e-6) - one.truth[..., 2:]
+        csi = _soft((late / SOFT_NS).square()) + _soft((turned / SOFT_TURN).square().sum(-1))
+        cost = cost + torch.where(hit, csi, 0.0)
+    return (one.worth * cost).sum()
+
+
+def _soft(square: Tensor) -> Tensor:
+    """Squares while they are small, twice their root when they are large."""
+    return 2 * ((1 + square).sqrt() - 1)
