@@ -201,10 +201,10 @@ def report_inputs(
 
 
 def gaussian_count(field: "RadioField") -> str:
-    """How many Gaussians a field has, and of how many given ones they were merged."""
+    """How many Gaussians a field has, and of how many given ones they were made by merging or correcting."""
     count, given = len(field.surface), field.meta.get("Gaussians given")
-    merged = isinstance(given, int) and given != count
-    return f"{count:,} merged from {given:,}" if merged else f"{count:,}"
+    changed = isinstance(given, int) and given != count
+    return f"{count:,} made of {given:,}" if changed else f"{count:,}"
 
 
 def _range_db(spectra: Spectrum) -> str:
