@@ -120,12 +120,12 @@ def test_a_greeting_that_comes_with_other_news_is_asked_for_again(crew, tmp_path
     address = crew._client.scheduler.address
     monkeypatch.setattr(distributed, "Client", interrupted)
     failures = 2
-    run_job(FakeJob(), tmp_path, crew=cluster.existing_cluster(address))
+    run_job(FakeJob(), tmp_path / "first", crew=cluster.existing_cluster(address))
     assert len(asked) == 3
-    assert len(files_of(tmp_path)) == 11
+    assert len(files_of(tmp_path / "first")) == 11
     failures = 6
     with pytest.raises(InputError, match=r"no dask scheduler answers at .*\(AssertionError\)"):
-        run_job(FakeJob(), tmp_path, crew=cluster.existing_cluster(address))
+        run_job(FakeJob(), tmp_path / "second", crew=cluster.existing_cluster(address))
     assert len(asked) == 6
 
 
