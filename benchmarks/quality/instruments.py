@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.quality.radiance.split import SplitConfig, split_of
+from benchmarks.quality.protocol.split import SplitConfig, split_of
 from rf3dgs.channel.arrays import planar_array
 from rf3dgs.channel.binning import bin_diffuse
 from rf3dgs.channel.io import PathsReader

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.quality.radiance.compare import difference, estimate
+from benchmarks.quality.protocol.compare import difference, estimate
 from rf3dgs.channel.response import manifold
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.grids import DirectionGrid

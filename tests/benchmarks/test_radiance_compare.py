@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from benchmarks.quality.radiance import compare
-from benchmarks.quality.radiance.compare import MUST_WIN, PEAK_MEAN, difference, estimate, in_common
+from benchmarks.quality.protocol import compare
+from benchmarks.quality.protocol.compare import MUST_WIN, PEAK_MEAN, difference, estimate, in_common
 
 from rf3dgs.evaluation.scores import SCORE
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from benchmarks.quality.radiance import data, scenes
-from benchmarks.quality.radiance.data import geometry_of
-from benchmarks.quality.radiance.scenes import MOVED, SITES, Setting, under_a_roof
+from benchmarks.quality.protocol import data, scenes
+from benchmarks.quality.protocol.data import geometry_of
+from benchmarks.quality.protocol.scenes import MOVED, SITES, Setting, under_a_roof
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.propagation.sites.lobby import lobby
@@ -75,7 +75,7 @@ def test_what_nobody_sees_takes_no_gaussians(monkeypatch, tmp_path):
 def test_a_mesh_is_sampled_once(tmp_path, monkeypatch):
     setting = Setting("round-room", "realistic")
     first = geometry_of("mesh", setting, tmp_path, count=500)
-    monkeypatch.setattr("benchmarks.quality.radiance.data.sample_mesh", lambda *args, **named: pytest.fail("again"))
+    monkeypatch.setattr("benchmarks.quality.protocol.data.sample_mesh", lambda *args, **named: pytest.fail("again"))
     assert torch.equal(first.means, geometry_of("mesh", setting, tmp_path, count=500).means)
 
 

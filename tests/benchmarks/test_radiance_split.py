@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from benchmarks.quality.radiance.split import HOLDOUTS, JUDGES, SplitConfig, split_of
+from benchmarks.quality.protocol.split import HOLDOUTS, JUDGES, SplitConfig, split_of
 
 from rf3dgs.core.errors import InputError
 

@@ -6,11 +6,14 @@ import math
 import numpy as np
 import pytest
 import torch
+from benchmarks.quality.methods import methods_of
+from benchmarks.quality.methods.field import changed
+from benchmarks.quality.methods.method import Task
+from benchmarks.quality.protocol import cells, compare, data, study
+from benchmarks.quality.protocol.results import Place, Results
 from benchmarks.quality.radiance import __main__ as command
-from benchmarks.quality.radiance import aging, cells, compare, data
+from benchmarks.quality.radiance import aging
 from benchmarks.quality.radiance.checks import beats_baselines, reaches
-from benchmarks.quality.radiance.models import changed, model_of
-from benchmarks.quality.radiance.results import Place, Results
 from benchmarks.quality.radiance.tables import page_of, text_of
 
 from rf3dgs.channel.io import PathsWriter
@@ -18,7 +21,10 @@ from rf3dgs.channel.paths import Paths
 from rf3dgs.core.angles import angles_of
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
+from rf3dgs.core.grids import equirect_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT
+from rf3dgs.spectra.codec import DbWindow
+from rf3dgs.spectra.spectrum import Instrument, Spectrum, stack_spectra
 from rf3dgs.splats.ply import write_ply
 from rf3dgs.splats.surface import sample_mesh
 from rf3dgs.training.config import RadioConfig
@@ -65,7 +71,6 @@ def write_paths(folder, place: torch.Tensor, *, noise: float = 0.0):
 @pytest.fixture
 def words(tmp_path, monkeypatch):
     """The words of a small table of lookups, whose second solve needs no tracer."""
-    monkeypatch.setattr(data, "GRID", (36, 18))
     monkeypatch.setattr(compare, "RESAMPLES", 200)
     monkeypatch.setattr(
         data, "paths_of", lambda *args: write_paths(tmp_path / "second.h5", args[2].position, noise=0.1)
@@ -75,6 +80,9 @@ def words(tmp_path, monkeypatch):
         *("--preset", "diffuse", "--paths", f"diffuse={first}", "--out", str(tmp_path / "out"), "--receivers"),
         *(
             str(RECEIVERS),
+            "--size",
+            "36",
+            "18",
             "--again",
             "4",
             "--held",
@@ -105,7 +113,7 @@ def test_a_second_run_makes_nothing_and_says_the_same(words, tmp_path, capsys, m
     assert (
         len(before) == 2 * 2 * 2 * 2 + 2
     )  # hold-outs, positions, seeds, models; and the second solve of each hold-out
-    monkeypatch.setattr(command, "make_cells", lambda *args: pytest.fail("a cell was made again"))
+    monkeypatch.setattr(study, "make_cells", lambda *args: pytest.fail("a cell was made again"))
     assert command.main(words) == 0
     assert capsys.readouterr().out == said
     assert stored(tmp_path) == before
@@ -120,12 +128,12 @@ def test_a_run_that_was_stopped_goes_on_and_ends_alike(words, tmp_path, monkeypa
             raise KeyboardInterrupt
         honest(keys, *rest)
 
-    monkeypatch.setattr(command, "make_cells", stopping)
+    monkeypatch.setattr(study, "make_cells", stopping)
     with pytest.raises(KeyboardInterrupt):
         command.main(words)
     first = stored(tmp_path)
     assert 0 < len(first) < 18
-    monkeypatch.setattr(command, "make_cells", honest)
+    monkeypatch.setattr(study, "make_cells", honest)
     assert command.main(words) == 0
     after = stored(tmp_path)
     assert len(after) == 18
@@ -243,6 +251,11 @@ def test_tables_fit_80_columns(words, capsys):
     assert "region hold-out, 20 training positions, 5 validation" in out
 
 
+def spectrum() -> Spectrum:
+    grid = equirect_grid(12, 6)
+    return Spectrum(torch.ones(grid.shape), grid, Pose(TX), 60e9, Instrument.gaussian(0.1), "test")
+
+
 PLACE = Place("lobby", "realistic", "random", 40)
 COLUMNS = {
     "peak_deg": 5.0,
@@ -329,12 +342,13 @@ def test_pages_of_planted_results_show_verdicts():
 
 
 def test_a_variant_changes_the_settings_it_names():
-    model = model_of("bare=paper,line_of_sight=surface,steps=7,train_opacity=false")
-    config = model.config(3, -150.0)
-    assert (config.line_of_sight, config.steps, config.train_opacity) == ("surface", 7, False)
-    assert (config.seed, config.floor_db) == (3, -150.0)
-    assert model_of("best=paper,preset=best").config(0, -150.0).steps == RadioConfig.best().steps
-    assert model_of("laws=mirror,without=lit+residual").config(0, -150.0).without == ("lit", "residual")
+    words = ["bare=paper,line_of_sight=surface,steps=7,train_opacity=false", "best=paper,preset=best"]
+    task = Task(stack_spectra([spectrum()]), DbWindow(-150.0, -50.0), seed=3)
+    bare, best, laws = (one.settings(task) for one in methods_of([*words, "laws=mirror,without=lit+residual"]))
+    assert (bare["line_of_sight"], bare["steps"], bare["train_opacity"]) == ("surface", 7, False)
+    assert (bare["seed"], bare["floor_db"]) == (3, -150.0)
+    assert best["steps"] == RadioConfig.best().steps
+    assert laws["without"] == ["lit", "residual"]
 
 
 @pytest.mark.parametrize(
@@ -349,11 +363,11 @@ def test_a_variant_changes_the_settings_it_names():
 )
 def test_a_variant_that_means_nothing_is_refused(text, message):
     with pytest.raises(InputError, match=message):
-        model_of(text)
+        methods_of([text])
 
 
 def test_a_setting_that_does_not_exist_is_refused():
     with pytest.raises(InputError, match="has no setting 'spam'"):
-        model_of("x=paper,spam=1").config(0, -150.0)
+        methods_of(["x=paper,spam=1"])
     with pytest.raises(InputError, match=r"has no setting 'steps.deep'"):
         changed(RadioConfig(), {"steps.deep": 1})

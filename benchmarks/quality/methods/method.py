@@ -46,6 +46,8 @@ class Method:
     needs: tuple[Need, ...] = ()
     settings: Callable[[Task], Mapping[str, Any]] = lambda task: {}
     """All that decides its answer beside the task, as JSON: a cell made with other settings is made anew."""
+    vary: "Callable[..., Method] | None" = None
+    """`vary(name, changes=...)` is this method under another name with some settings changed; None: it has none."""
 
     def made(self, task: Task) -> Predictor:
         """The trained predictor; InputError where the task lacks what the method needs."""

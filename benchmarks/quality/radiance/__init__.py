@@ -1,1 +1,1 @@
-"""The one table that judges radiance models against lookup: data, splits, cells, statistics, checks and pages."""
+"""The table that judges radiance models against lookup, by one command: what is asked, checked and shown."""

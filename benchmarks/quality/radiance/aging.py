@@ -15,10 +15,12 @@ from dataclasses import dataclass
 
 import torch
 
-from benchmarks.quality.radiance.__main__ import Run, asked, say
-from benchmarks.quality.radiance.cells import Truth
-from benchmarks.quality.radiance.models import Model, model_of
-from benchmarks.quality.radiance.scenes import BEFORE, Setting
+from benchmarks.quality.methods import methods_of
+from benchmarks.quality.methods.method import Method, Task
+from benchmarks.quality.protocol.cells import Truth
+from benchmarks.quality.protocol.scenes import BEFORE
+from benchmarks.quality.protocol.study import say
+from benchmarks.quality.radiance.__main__ import Run, asked
 from rf3dgs.core.errors import RfError
 from rf3dgs.evaluation.protocol import Predictor
 from rf3dgs.evaluation.scores import SCORE
@@ -40,13 +42,13 @@ class Attempt:
 
 
 def attempts(
-    model: Model, before: Spectrum, new: Sequence[Spectrum], made: Callable[[Model, Spectrum], Predictor]
+    model: Method, before: Spectrum, new: Sequence[Spectrum], made: Callable[[Method, Spectrum], Predictor]
 ) -> Iterator[Attempt]:
     """The attempts with spectra `before` and each of the `new` sets; `made` trains a model or fills a lookup."""
-    lookups = [model_of("nearest"), model_of("idw4")]
+    lookups = methods_of(("nearest", "idw4"))
     kept: dict[str, Predictor] = {}
 
-    def stale(one: Model) -> Predictor:
+    def stale(one: Method) -> Predictor:
         if one.name not in kept:
             kept[one.name] = made(one, before)
         return kept[one.name]
@@ -86,26 +88,27 @@ def main(words: Sequence[str] | None = None) -> int:
     try:
         wish = asked(["--scene", own.scene, *rest])
         run, seed = Run(wish), own.seed
-        now, then = (run.data(Setting(name, wish.preset[0])) for name in (own.scene, BEFORE[own.scene]))
-        window = then.window()
-        geometry = run.geometry(now.setting)
+        study = run.study(wish.preset[0])
+        now, then = study.data, run.study(wish.preset[0], BEFORE[own.scene]).data
+        window, geometry = then.window(), study.geometry
 
-        def made(model: Model, train: Spectrum) -> Predictor:
-            return model.made(train, geometry, seed, window.floor_db)
+        def made(model: Method, train: Spectrum) -> Predictor:
+            return model.made(Task(train, window, seed, "paper", geometry))
 
         new = [now.training(count, seed) for count in own.new]
         judges = {"before": then, "now": now}
         truths = {
-            (judge, holdout): Truth.of(data.judged(wish.judge, holdout, run.reason), window)
+            (judge, holdout): Truth.of(data.judged(wish.judge, holdout, run.reason()), window)
             for judge, data in judges.items()
             for holdout in wish.holdout
         }
         print(f"{'':34}{'judged':>8}{'CPU [s]':>9}  " + "   ".join(wish.holdout), flush=True)
-        for one in attempts(model_of(own.model), then.training(own.positions, seed), new, made):
+        for one in attempts(methods_of([own.model])[0], then.training(own.positions, seed), new, made):
             start = time.process_time()
             predictor = one.make()
             spent = time.process_time() - start
-            rows = [truths[one.judge, holdout].scored(predictor) for holdout in wish.holdout]
+            judges = [truths[one.judge, holdout] for holdout in wish.holdout]
+            rows = [truth.scored(truth.drawn(predictor)) for truth in judges]
             texts = [
                 " / ".join(SCORE[key].text(SCORE[key].of(row[SCORE[key].column])) for key in COLUMNS) for row in rows
             ]

@@ -4,8 +4,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from benchmarks.quality.radiance.compare import MUST_NOT_LOSE, MUST_WIN
-from benchmarks.quality.radiance.results import Place, Results
+from benchmarks.quality.protocol.compare import MUST_NOT_LOSE, MUST_WIN
+from benchmarks.quality.protocol.results import Place, Results
 from rf3dgs.evaluation.scores import SCORE, Score
 from rf3dgs.evaluation.table import Estimate
 

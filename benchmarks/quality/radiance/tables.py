@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from benchmarks.quality.protocol.compare import MUST_NOT_LOSE, MUST_WIN, ROWS
+from benchmarks.quality.protocol.results import Place, Results
 from benchmarks.quality.radiance.checks import checks
-from benchmarks.quality.radiance.compare import MUST_NOT_LOSE, MUST_WIN, ROWS
-from benchmarks.quality.radiance.results import Place, Results
 from rf3dgs.evaluation.table import Estimate
 
 WIDTH = 80

@@ -1,13 +1,14 @@
 """Which positions serve what: a sealed test, at random and in a region, each with a validation part of its own."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from rf3dgs.core.errors import InputError
-from rf3dgs.data.split import places_of
+from rf3dgs.data.split import places_of, protocol
 
 HOLDOUTS = ("random", "region")
 JUDGES = ("validation", "test")
@@ -18,6 +19,10 @@ PARTS = {
     ("test", "region"): "region",
 }
 STORED = {"pool": "train", "validation region": "validation"}  # what a dataset calls them; the others are called alike
+
+
+Draw = Literal["uniform", "clustered"]
+CLUSTERS = 4
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ class Split:
     """A part's name for each position, "pool" being what training positions are drawn from, "buffer" nothing."""
 
     names: tuple[str, ...]
-    config: SplitConfig
+    config: "SplitConfig | None" = None
 
     def where(self, name: str) -> np.ndarray:
         """The positions `[n]` of one part, in ascending order."""
@@ -53,8 +58,11 @@ class Split:
         """The positions `[n]` that judge a hold-out: "validation" or, sealed, "test"."""
         return self.where(PARTS[judge, holdout])
 
-    def training(self, count: int, seed: int) -> np.ndarray:
-        """`count` positions of the pool in ascending order; of one seed the fewer are among the more."""
+    def training(self, count: int, seed: int, draw: Draw = "uniform", ground: np.ndarray | None = None) -> np.ndarray:
+        """`count` positions of the pool in ascending order; of one seed the fewer are among the more.
+
+        "clustered": those nearest to four of them drawn at random, with all positions `ground` `[n, 2]` [m].
+        """
         pool = self.where("pool")
         if not 1 <= count <= len(pool):
             raise InputError(
@@ -62,6 +70,10 @@ class Split:
                 "trace more receivers, or hold out fewer"
             )
         order = np.random.default_rng((seed, 1)).permutation(pool)
+        if draw == "clustered":
+            assert ground is not None
+            away = np.linalg.norm(ground[pool][:, None] - ground[order[:CLUSTERS]], axis=-1).min(1)
+            order = pool[np.argsort(away, kind="stable")]
         return np.sort(order[:count])
 
     @property
@@ -108,6 +120,11 @@ def split_of(positions: Tensor, config: SplitConfig | None = None) -> Split:
     names[free[: config.test]] = "test"
     names[free[config.test : config.test + config.validation]] = "validation"
     return Split(tuple(str(name) for name in names), config)
+
+
+def paper_split(positions: Tensor, seed: int = 0) -> Split:
+    """The paper's parts of positions `[n, 3]`: a fifth at random is the test, the others are the pool."""
+    return Split(tuple("pool" if role == "train" else role for role in protocol(positions, seed=seed)))
 
 
 def _beside(ground: np.ndarray, away: np.ndarray, edge: float, config: SplitConfig) -> tuple[int, float]:

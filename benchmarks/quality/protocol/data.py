@@ -12,22 +12,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.quality.radiance.scenes import BEFORE, Setting, paths_of
-from benchmarks.quality.radiance.split import HOLDOUTS, PARTS, Split, SplitConfig, split_of
+from benchmarks.quality.protocol.pictures import SPHERE, Pictures
+from benchmarks.quality.protocol.scenes import BEFORE, Setting, paths_of
+from benchmarks.quality.protocol.split import HOLDOUTS, PARTS, Draw, Split, SplitConfig, paper_split, split_of
 from rf3dgs.channel.io import PathsReader
 from rf3dgs.channel.paths import Paths
 from rf3dgs.cli.chain import REPEAT_RAYS, REPEAT_SEED
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.files import write_whole
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import equirect_grid, view_of
+from rf3dgs.core.grids import view_of
 from rf3dgs.core.progress import Console, Progress
 from rf3dgs.data.dataset import Dataset
 from rf3dgs.data.stream import stream_spectra
 from rf3dgs.field.lit import BLENDING
 from rf3dgs.propagation.config import TraceConfig
 from rf3dgs.spectra.codec import DbWindow, window_of
-from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.ply import read_ply, write_ply
@@ -36,25 +36,34 @@ from rf3dgs.splats.surface import sample_faces, sample_mesh
 from rf3dgs.training.checkpoint import fingerprint
 from rf3dgs.training.lit_views import LEAST_WEIGHT
 
-GRID = (180, 90)
 RANGE_DB = 80.0  # between the window's ends
 EYES = 100  # receivers that say what of a large site matters
 
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """A scene under a preset: `dataset` with the sealed test, the `split`, and a `digest` of both."""
+    """A scene under a preset: `dataset` with the sealed test, the `split` of positions, and a `digest` of both.
+
+    views: pictures of a position, which follow each other in the dataset.
+    """
 
     setting: Setting
     dataset: Dataset
     split: Split
     digest: str
+    views: int = 1
 
-    def training(self, count: int, seed: int) -> Spectrum:
-        """The spectra `[count, row, col]` of the training positions."""
+    @property
+    def positions(self) -> Tensor:
+        """All positions `[position, 3]` [m]; each has `views` pictures."""
+        return self.dataset.pose.position[:: self.views]
+
+    def training(self, count: int, seed: int, draw: Draw = "uniform") -> Spectrum:
+        """The pictures `[count x views, row, col]` of the training positions."""
         pool = self.dataset.train
         assert pool.spectra is not None
-        return pool.spectra[torch.isin(pool.index, torch.from_numpy(self.split.training(count, seed)))]
+        chosen = self.split.training(count, seed, draw, self.positions[:, :2].double().numpy())
+        return pool.spectra[torch.isin(pool.index // self.views, torch.from_numpy(chosen))]
 
     def window(self) -> DbWindow:
         """The dB window of every score: that of the whole pool, so that it depends on neither model nor cell.
@@ -68,63 +77,74 @@ class Data:
         found = window_of(pool)
         return DbWindow(max(found.floor_db, found.ceil_db - RANGE_DB), found.ceil_db)
 
-    def judged(self, judge: str, holdout: str, reason: str) -> Spectrum:
-        """The truth `[n, row, col]` of a hold-out; a sealed one is logged with the reason."""
-        found = spectra_at(self.dataset, judge, holdout, reason, self.places(judge, holdout))
+    def judged(self, judge: str, holdout: str, reason: str, most: int | None = None) -> Spectrum:
+        """The truth `[n x views, row, col]` of a hold-out; a sealed one is logged with the reason.
+
+        most: of so many positions, the first ones; None of all.
+        """
+        found = spectra_at(self.dataset, judge, holdout, reason, self.places(judge, holdout)[:most])
         assert found is not None
         return found
 
     def places(self, judge: str, holdout: str) -> Tensor:
         """The positions `[n, 3]` [m] of a hold-out."""
-        return self.dataset.pose.position[torch.from_numpy(self.split.part(judge, holdout))]
+        return self.positions[torch.from_numpy(self.split.part(judge, holdout))]
 
 
 def data_of(
     setting: Setting,
     folder: Path,
-    config: SplitConfig,
+    config: SplitConfig | None,
     *,
     receivers: int,
     paths: Path | None = None,
+    pictures: Pictures = SPHERE,
     progress: Progress | None = None,
 ) -> Data:
     """The spectra of a setting in `folder`, traced and made where they are not there yet.
 
-    receivers: the first so many. paths: a folder of `rf3dgs trace` to take them from. Raises InputError where the
-    folder holds other data.
+    config: how positions are split; None as in the paper. receivers: the first so many. paths: a folder of `rf3dgs
+    trace` to take them from. pictures: what is seen at each. Raises InputError where the folder holds other data.
     """
     progress = Console() if progress is None else progress
-    plan = {"setting": asdict(setting), "grid": list(GRID), "split": asdict(config), "receivers": receivers}
+    split_plan = "paper" if config is None else asdict(config)
+    plan = {"setting": asdict(setting), "split": split_plan, "receivers": receivers, "pictures": asdict(pictures)}
 
     def traced() -> Path:
         return paths or paths_of(setting, folder / "first.paths", setting.receivers(receivers), TraceConfig(), progress)
 
-    def roles_of(positions: Tensor) -> tuple[str, ...]:
-        return split_of(positions, config).roles
+    def splitting(positions: Tensor) -> Split:
+        return paper_split(positions) if config is None else split_of(positions, config)
 
-    dataset = _dataset(folder / "dataset", plan, traced, receivers, roles_of, progress)
-    split = split_of(dataset.pose.position, config)
-    if split.roles != dataset.roles:
+    def roles_of(positions: Tensor) -> tuple[str, ...]:
+        return splitting(positions).roles
+
+    dataset = _dataset(folder / "dataset", plan, traced, receivers, roles_of, pictures, progress)
+    split = splitting(dataset.pose.position[:: pictures.views])
+    if tuple(np.repeat(split.roles, pictures.views)) != dataset.roles:
         raise DataError(f"{folder}: the roles of the dataset are not those of the split; remove the folder")
     digest = hashlib.sha256((folder / "dataset" / "spectra.h5").read_bytes() + json.dumps(split.names).encode())
-    return Data(setting, dataset, split, digest.hexdigest())
+    return Data(setting, dataset, split, digest.hexdigest(), pictures.views)
 
 
-def second_solve(data: Data, folder: Path, judge: str, count: int, *, progress: Progress | None = None) -> Dataset:
+def second_solve(
+    data: Data, folder: Path, judge: str, count: int, *, pictures: Pictures = SPHERE, progress: Progress | None = None
+) -> Dataset:
     """The first `count` positions of each hold-out traced again with another seed and number of rays, in `folder`."""
     progress = Console() if progress is None else progress
     index = np.sort(np.concatenate([data.split.part(judge, holdout)[:count] for holdout in HOLDOUTS])).tolist()
+    views = data.views
     config = TraceConfig(seed=REPEAT_SEED, rays=round(TraceConfig().rays * REPEAT_RAYS))
     plan = {"of": data.digest, "judge": judge, "count": count, "trace": asdict(config)}
 
     def traced() -> Path:
-        rx = data.dataset.pose[torch.tensor(index)]
+        rx = data.dataset.pose[views * torch.tensor(index)]
         return paths_of(data.setting, folder / f"second-{judge}.paths", rx, config, progress)
 
     def roles_of(positions: Tensor) -> tuple[str, ...]:
-        return tuple(data.dataset.roles[place] for place in index)
+        return tuple(data.dataset.roles[views * place] for place in index)
 
-    return _dataset(folder / f"second-{judge}", plan, traced, len(index), roles_of, progress)
+    return _dataset(folder / f"second-{judge}", plan, traced, len(index), roles_of, pictures, progress)
 
 
 def _dataset(
@@ -133,6 +153,7 @@ def _dataset(
     paths: Callable[[], Path],
     count: int,
     roles_of: Callable[[Tensor], tuple[str, ...]],
+    pictures: Pictures,
     progress: Progress,
 ) -> Dataset:
     """The dataset in `folder`, made of the first `count` receivers of the paths that `paths` finds or traces."""
@@ -143,9 +164,10 @@ def _dataset(
             raise InputError(f"{folder} holds data made with other settings; remove it, or give another --out")
         return Dataset.load(folder)
     parts = folder.with_name(f"{folder.name}.parts")
-    spectra = _spectra(paths(), parts, count, progress)
+    spectra = _spectra(paths(), parts, count, pictures, progress)
     write_whole(file, (json.dumps(wanted, indent=1) + "\n").encode())
-    made = Dataset((), spectra, roles=roles_of(spectra.pose.position), meta={"plan": wanted}).save(folder)
+    roles = np.repeat(roles_of(spectra.pose.position[:: pictures.views]), pictures.views).tolist()
+    made = Dataset((), spectra, roles=roles, meta={"plan": wanted}).save(folder)
     shutil.rmtree(parts, ignore_errors=True)
     return made
 
@@ -175,16 +197,12 @@ class _First:
         return self.paths[index]
 
 
-def _spectra(paths: Path, folder: Path, count: int, progress: Progress) -> Spectrum:
-    grid = equirect_grid(*GRID)
-
-    def spectrum(number: int, one: Paths) -> Spectrum:
-        return spectrum_of(one, None, grid)
-
+def _spectra(paths: Path, folder: Path, count: int, pictures: Pictures, progress: Progress) -> Spectrum:
     with PathsReader(paths) as reader:
         first = _First(reader, count)
-        meta = {"generator": "benchmarks.quality.radiance", "seed": 0}
-        return stream_spectra(first, spectrum, folder, settings={"grid": list(GRID)}, meta=meta, progress=progress)
+        meta = {"generator": "benchmarks.quality.protocol", "seed": 0}
+        settings = asdict(pictures)
+        return stream_spectra(first, pictures.of, folder, settings=settings, meta=meta, progress=progress)
 
 
 def geometry_of(
@@ -236,7 +254,7 @@ def _in_sight(vertices: Tensor, faces: Tensor, eyes: Tensor, count: int) -> Tens
     most = torch.zeros(len(gaussians))
     for eye in eyes:
         values = torch.zeros(len(gaussians), 1).requires_grad_()
-        drawn = rasterize(*shape, values, view_of(Pose(eye), equirect_grid(*GRID)), compositing=BLENDING)
+        drawn = rasterize(*shape, values, view_of(Pose(eye), SPHERE.grid), compositing=BLENDING)
         most = torch.maximum(most, torch.autograd.grad(drawn.values.sum(), values)[0][:, 0])
     held = torch.bincount(face, minlength=len(faces))
     return (torch.bincount(face[most > LEAST_WEIGHT], minlength=len(faces)) > 0) | (held == 0)

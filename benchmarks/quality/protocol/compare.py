@@ -56,26 +56,29 @@ class Difference:
 NOTHING = Estimate(math.nan, math.nan, math.nan)
 
 
-def estimate(values: np.ndarray, score: Score, seed: int = 0) -> Estimate:
-    """A score of one model `[seed, position]`; positions where it does not apply in some seed are left out."""
-    values = values[:, ~np.isnan(values).any(0)]
-    if not values.size:
+def estimate(values: np.ndarray, score: Score, seed: int = 0, *, views: int = 1) -> Estimate:
+    """A score of one model `[seed, picture]`; pictures where it does not apply in some seed are left out."""
+    good = ~np.isnan(values).any(0)
+    if not good.any():
         return NOTHING
-    return _with_interval(score.of(values.reshape(-1)), _resampled((values,), score, seed)[0], values.shape)
+    group = _groups(good, views)
+    values = values[:, good]
+    return _with_interval(score.of(values.reshape(-1)), _resampled((values,), group, score, seed)[0], group)
 
 
-def difference(model: np.ndarray, baseline: np.ndarray, score: Score, seed: int = 0) -> Difference:
-    """A model against a baseline, both `[seed, position]` with the same seeds and positions in the same order."""
+def difference(model: np.ndarray, baseline: np.ndarray, score: Score, seed: int = 0, *, views: int = 1) -> Difference:
+    """A model against another, both `[seed, picture]` with the same seeds and pictures in the same order."""
     if model.shape != baseline.shape:
         raise ValueError(f"both need the same seeds and positions; got {model.shape} and {baseline.shape}")
     good = ~(np.isnan(model) | np.isnan(baseline)).any(0)
-    model, baseline = model[:, good], baseline[:, good]
-    if not model.size:
+    if not good.any() or not len(model):
         return Difference(NOTHING, "unknown", 0, 0)
+    group = _groups(good, views)
+    model, baseline = model[:, good], baseline[:, good]
     value = score.of(model.reshape(-1)) - score.of(baseline.reshape(-1))
-    of_model, of_baseline = _resampled((model, baseline), score, seed)
-    found = _with_interval(value, of_model - of_baseline, model.shape)
-    return Difference(found, _verdict(found, score), model.shape[1], model.shape[0])
+    of_model, of_baseline = _resampled((model, baseline), group, score, seed)
+    found = _with_interval(value, of_model - of_baseline, group)
+    return Difference(found, _verdict(found, score), int(group.max()) + 1, len(model))
 
 
 def in_common(cells: Mapping[str, Mapping[int, Mapping[str, np.ndarray]]], names: Sequence[str]) -> list[int]:
@@ -91,25 +94,38 @@ def _verdict(found: Estimate, score: Score) -> Verdict:
     return "better" if (found.high < 0.0) == (score.better == "lower") else "worse"
 
 
-def _with_interval(value: float, draws: np.ndarray, shape: tuple[int, ...]) -> Estimate:
-    if shape[1] < 2:
+def _groups(good: np.ndarray, views: int) -> np.ndarray:
+    """The number of the position of each picture that is left, counted without gaps."""
+    return np.unique(np.flatnonzero(good) // views, return_inverse=True)[1]
+
+
+def _with_interval(value: float, draws: np.ndarray, group: np.ndarray) -> Estimate:
+    if group.max() < 1:
         return Estimate(value, math.nan, math.nan)
     low, high = np.percentile(draws, LEVELS)
     return Estimate(value, float(low), float(high))
 
 
-def _resampled(values: Sequence[np.ndarray], score: Score, seed: int) -> list[np.ndarray]:
-    """The score `[resample]` of each matrix `[seed, position]`, all under the same resamples."""
-    seeds, positions = values[0].shape
+def _resampled(values: Sequence[np.ndarray], group: np.ndarray, score: Score, seed: int) -> list[np.ndarray]:
+    """The score `[resample]` of each matrix `[seed, picture]`, all under the same resamples of seeds and positions."""
+    seeds, positions = len(values[0]), int(group.max()) + 1
     random = np.random.default_rng((seed, seeds, positions))
     rows = random.integers(0, seeds, (RESAMPLES, seeds))
     columns = random.integers(0, positions, (RESAMPLES, positions))
     if score.statistic in ("mean", "within_1"):
-        of_rows, of_columns = _counts(rows, seeds), _counts(columns, positions)
+        of_rows, of_columns = _counts(rows, seeds), _counts(columns, positions)[:, group]
+        of_columns /= of_columns.sum(1, keepdims=True)
         unit = 100.0 if score.statistic == "within_1" else 1.0
         parts = [value <= 1.0 if score.statistic == "within_1" else value for value in values]
         return [unit * np.einsum("rs,sp,rp->r", of_rows, part, of_columns, optimize=True) for part in parts]
-    return [score.over(value[rows[:, :, None], columns[:, None]].reshape(RESAMPLES, -1)) for value in values]
+    if len(group) == positions:
+        return [score.over(value[rows[:, :, None], columns[:, None]].reshape(RESAMPLES, -1)) for value in values]
+    members = [np.flatnonzero(group == position) for position in range(positions)]
+    index = [np.concatenate([members[position] for position in drawn]) for drawn in columns]
+    return [
+        np.array([score.over(value[row][:, some].reshape(-1)) for row, some in zip(rows, index, strict=True)])
+        for value in values
+    ]
 
 
 def _counts(index: np.ndarray, size: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Cells of the table: one model trained on one set of positions and judged by one hold-out, a JSON file each.
+"""Cells of a table: one method trained on one set of positions and judged by one hold-out, a JSON file each.
 
 A cell holds every position's scores, what it cost, and what it was made from; one that is there and was made from the
 same is never made again.
@@ -7,6 +7,7 @@ same is never made again.
 import json
 import math
 import os
+import platform
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
@@ -19,7 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.quality.radiance.models import Model
+from benchmarks.quality.methods.method import Method, Task
+from benchmarks.quality.protocol.split import Draw
 from rf3dgs.channel.arrays import planar_array
 from rf3dgs.core.files import write_whole
 from rf3dgs.evaluation import beams
@@ -28,7 +30,7 @@ from rf3dgs.evaluation.provenance import versions
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
-from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.training.checkpoint import fingerprint
 
 SECOND = "second solve"
 ARRAY = planar_array(8, 8, pattern="patch")
@@ -37,8 +39,8 @@ Values = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Key:
-    """Which cell: `count` training positions drawn by `seed`; `geometry` is "none" for lookups; `trained` names the
-    scene that the training spectra are of, which is `scene` unless things have moved."""
+    """Which cell: `count` training positions drawn by `seed`; `geometry` is "none" for methods without; `trained` names
+    the scene that the training spectra are of, which is `scene` unless things have moved."""
 
     scene: str
     preset: str
@@ -49,39 +51,47 @@ class Key:
     seed: int
     model: str
     trained: str
+    draw: Draw = "uniform"
 
     def path(self, folder: Path) -> Path:
         """Where the cell is kept."""
         trained = "" if self.trained == self.scene else f"-after-{self.trained}"
-        name = (
-            f"{self.holdout}-{self.count:03d}-{self.seed}-{self.geometry}-{self.model.replace(' ', '-')}{trained}.json"
-        )
+        drawn, model = "" if self.draw == "uniform" else f"-{self.draw}", self.model.replace(" ", "-")
+        name = f"{self.holdout}-{self.count:03d}-{self.seed}-{self.geometry}-{model}{trained}{drawn}.json"
         return folder / "cells" / self.judge / f"{self.scene}-{self.preset}" / name
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a hold-out is judged by: `spectra` `[n, row, col]`, their covariances, the window."""
+    """What a hold-out is judged by: `spectra` `[n, row, col]`, their covariances, the window.
+
+    views: pictures of a position, which follow each other.
+    """
 
     spectra: Spectrum
     covariance: Tensor
     window: DbWindow
+    views: int = 1
 
     @classmethod
-    def of(cls, spectra: Spectrum, window: DbWindow) -> "Truth":
-        return cls(spectra, beams.panel_covariance(spectra, ARRAY), window)
+    def of(cls, spectra: Spectrum, window: DbWindow, views: int = 1) -> "Truth":
+        return cls(spectra, beams.panel_covariance(spectra, ARRAY), window, views)
 
-    def scored(self, predictor: Predictor) -> Values:
-        """Every position's scores of what a predictor renders there."""
+    def drawn(self, predictor: Predictor) -> Spectrum:
+        """What a predictor renders at every pose `[n, row, col]`."""
         with torch.no_grad():
             poses = [self.spectra.pose[index] for index in range(len(self.spectra))]
-            drawn = stack_spectra([predictor.render(pose, self.spectra.grid) for pose in poses])
+            return stack_spectra([predictor.render(pose, self.spectra.grid) for pose in poses])
+
+    def scored(self, drawn: Spectrum) -> Values:
+        """Every picture's scores."""
+        with torch.no_grad():
             return score(self.spectra, drawn, self.covariance, self.window, ARRAY)
 
     def second(self, repeat: Spectrum) -> Values:
         """Scores of the second solve `[m, row, col]` of some of the positions, NaN at the others."""
         apart = torch.cdist(repeat.pose.position.double(), self.spectra.pose.position.double())
-        place = apart.argmin(1)
+        place = apart.argmin(1) + torch.arange(len(repeat)) % self.views
         found = score(self.spectra[place], repeat, self.covariance[place], self.window, ARRAY)
         values = {}
         for name, value in found.items():
@@ -110,34 +120,41 @@ def values_of(cell: Mapping[str, Any]) -> Values:
 
 def make_cells(
     keys: Sequence[Key],
-    model: Model,
-    train: Spectrum,
+    method: Method,
+    task: Task,
     truths: Mapping[str, Truth],
-    geometry: Gaussians | None,
     identity: Mapping[str, Any],
     folder: Path,
 ) -> None:
-    """Train a model once and write the cells `keys`, which differ in the hold-out alone."""
-    first = keys[0]
+    """Train a method once and write the cells `keys`, which differ in the hold-out alone."""
+    train = task.spectra
     for key in keys:
         refuse_leak(train.pose.position, truths[key.holdout].spectra.pose.position)
     load = os.getloadavg()[0]
     reset_peak()
     clock = _Clock()
-    predictor = model.made(train, geometry, first.seed, truths[first.holdout].window.floor_db)
-    fit = clock.lap()
-    facts: dict[str, Any] = {"fit": fit, "peak_memory_bytes": peak_memory(), "load": load}
+    predictor = method.made(task)
+    facts: dict[str, Any] = {"fit": clock.lap(), "peak_memory_bytes": peak_memory(), "load": load}
     if isinstance(predictor, RadioField):
         facts |= {"gaussians": len(predictor.solidity), "meta": dict(predictor.meta)}
     for key in keys:
-        clock = _Clock()
-        values = truths[key.holdout].scored(predictor)
-        _write(key, values, identity, facts | {"judging": clock.lap()}, folder)
+        truth, clock = truths[key.holdout], _Clock()
+        drawn = truth.drawn(predictor)
+        rendering = clock.lap() | {"pictures": len(drawn)}
+        values = truth.scored(drawn)
+        saw = {"trained": views_digest(train), "judged": views_digest(truth.spectra)}
+        _write(key, values, identity, facts | {"rendering": rendering, "views": truth.views, "saw": saw}, folder)
+
+
+def views_digest(spectra: Spectrum) -> str:
+    """What identifies the poses and the grid of pictures: two methods with the same saw the same views."""
+    return fingerprint((spectra.pose.position, spectra.pose.orientation, spectra.grid.directions))
 
 
 def make_second(key: Key, truth: Truth, repeat: Spectrum, identity: Mapping[str, Any], folder: Path) -> None:
     """Write the cell of the second solve: the best that anything can be expected to reach."""
-    _write(key, truth.second(repeat), identity, {"load": os.getloadavg()[0]}, folder)
+    facts = {"load": os.getloadavg()[0], "views": truth.views, "saw": {"judged": views_digest(truth.spectra)}}
+    _write(key, truth.second(repeat), identity, facts, folder)
 
 
 def _write(key: Key, values: Values, identity: Mapping[str, Any], facts: Mapping[str, Any], folder: Path) -> None:
@@ -145,7 +162,12 @@ def _write(key: Key, values: Values, identity: Mapping[str, Any], facts: Mapping
         "key": asdict(key),
         "identity": identity,
         **facts,
-        "made": {"when": datetime.now(UTC).isoformat(timespec="seconds"), "commit": commit(), "versions": versions()},
+        "made": {
+            "when": datetime.now(UTC).isoformat(timespec="seconds"),
+            "commit": commit(),
+            "machine": machine(),
+            "versions": versions(),
+        },
         "values": {name: [None if math.isnan(v) else float(v) for v in row] for name, row in values.items()},
     }
     write_whole(key.path(folder), (json.dumps(cell, indent=1, allow_nan=False) + "\n").encode())
@@ -169,6 +191,17 @@ def commit() -> str:
 
     name = git("rev-parse", "--short=12", "HEAD")
     return (name + ("+changes" if git("status", "--porcelain", "-uno") else "")) if name else "unknown"
+
+
+def machine() -> str:
+    """The processor and its cores, and the GPU where there is one."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        lines = []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    gpu = f", {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
+    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores{gpu}"
 
 
 def reset_peak() -> None:
