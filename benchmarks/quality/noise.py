@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.quality.protocol.figure import put_into
 from rf3dgs.channel.arrays import PlanarArray, planar_array
 from rf3dgs.channel.binning import bin_diffuse
 from rf3dgs.channel.paths import Paths
@@ -205,16 +206,6 @@ def page_tables(run: dict) -> str:
     return "\n".join(lines)
 
 
-def put_into(page: Path, tables: str) -> None:
-    """Replace what stands between the two marks of the page."""
-    text = page.read_text(encoding="utf-8")
-    head, mark, rest = text.partition("<!-- noise -->\n")
-    _, end, tail = rest.partition("<!-- end of noise -->")
-    if not mark or not end:
-        raise SystemExit(f"{page} has no marks <!-- noise --> and <!-- end of noise -->")
-    write_whole(page, f"{head}{mark}\n{tables}\n\n{end}{tail}".encode())
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", default="lobby")
@@ -234,7 +225,7 @@ def main() -> None:
     if wish.json is not None:
         write_whole(wish.json, (json.dumps(run, indent=1) + "\n").encode())
     if wish.page is not None:
-        put_into(wish.page, tables)
+        put_into(wish.page, "noise", tables)
 
 
 if __name__ == "__main__":

@@ -99,19 +99,24 @@ def data_of(
     receivers: int,
     paths: Path | None = None,
     pictures: Pictures = SPHERE,
+    rays: int | None = None,
     progress: Progress | None = None,
 ) -> Data:
     """The spectra of a setting in `folder`, traced and made where they are not there yet.
 
     config: how positions are split; None as in the paper. receivers: the first so many. paths: a folder of `rf3dgs
-    trace` to take them from. pictures: what is seen at each. Raises InputError where the folder holds other data.
+    trace` to take them from; otherwise `rays` are traced. pictures: what is seen at each. Raises InputError where the
+    folder holds other data.
     """
     progress = Console() if progress is None else progress
     split_plan = "paper" if config is None else asdict(config)
     plan = {"setting": asdict(setting), "split": split_plan, "receivers": receivers, "pictures": asdict(pictures)}
+    plan |= {"rays": rays} if paths is None else {}
 
     def traced() -> Path:
-        return paths or paths_of(setting, folder / "first.paths", setting.receivers(receivers), TraceConfig(), progress)
+        how = TraceConfig() if rays is None else TraceConfig(rays=rays)
+        first = folder / "first.paths"
+        return paths or paths_of(setting, first, setting.receivers(receivers), how, progress)
 
     def splitting(positions: Tensor) -> Split:
         return paper_split(positions) if config is None else split_of(positions, config)
@@ -128,13 +133,20 @@ def data_of(
 
 
 def second_solve(
-    data: Data, folder: Path, judge: str, count: int, *, pictures: Pictures = SPHERE, progress: Progress | None = None
+    data: Data,
+    folder: Path,
+    judge: str,
+    count: int,
+    *,
+    pictures: Pictures = SPHERE,
+    rays: int | None = None,
+    progress: Progress | None = None,
 ) -> Dataset:
     """The first `count` positions of each hold-out traced again with another seed and number of rays, in `folder`."""
     progress = Console() if progress is None else progress
     index = np.sort(np.concatenate([data.split.part(judge, holdout)[:count] for holdout in HOLDOUTS])).tolist()
     views = data.views
-    config = TraceConfig(seed=REPEAT_SEED, rays=round(TraceConfig().rays * REPEAT_RAYS))
+    config = TraceConfig(seed=REPEAT_SEED, rays=round((rays or TraceConfig().rays) * REPEAT_RAYS))
     plan = {"of": data.digest, "judge": judge, "count": count, "trace": asdict(config)}
 
     def traced() -> Path:

@@ -48,9 +48,13 @@ class StudyConfig:
     """None: what suits the scene. "paper": a fifth at random is the test, nothing is kept for validation."""
     receivers: int | None = None
     """The first so many; None: what suits the scene."""
+    rays: int | None = None
+    """Of traced paths; None: as `rf3dgs trace`."""
     pictures: Pictures = SPHERE
     geometry: str = "photos"
     """"photos", "mesh", or a .ply file."""
+    geometry_folder: Path | None = None
+    """Where made geometry is kept; None: in `out`."""
     mesh_count: int = 100_000
     scale: Scale = "laptop"
     paths: Mapping[str, Path] = field(default_factory=dict)
@@ -92,7 +96,8 @@ class Study:
     def geometry(self) -> Gaussians:
         config, setting = self.config, self.setting
         site = "lobby" if setting.photographs else setting.name
-        return geometry_of(config.geometry, setting, config.out / "geometry" / site, count=config.mesh_count)
+        folder = config.geometry_folder or config.out / "geometry"
+        return geometry_of(config.geometry, setting, folder / site, count=config.mesh_count)
 
     @cached_property
     def base(self) -> dict[str, Any]:
@@ -141,7 +146,9 @@ class Study:
             identity = self.base | {"receivers": count}
             if read_cell(key.path(config.out), identity) is None and not config.only_read:
                 folder = self._folder(self.setting)
-                solved = second_solve(self.data, folder, config.judge, count, pictures=config.pictures)
+                solved = second_solve(
+                    self.data, folder, config.judge, count, pictures=config.pictures, rays=config.rays
+                )
                 judged = self.truth(holdout)
                 wanted = judged.spectra.pose.position
                 repeat = spectra_at(solved, config.judge, holdout, config.reason(), wanted)
@@ -194,6 +201,7 @@ class Study:
             receivers=config.receivers or site.receivers,
             paths=config.paths.get(config.preset) if setting.name == config.scene else None,
             pictures=config.pictures,
+            rays=config.rays,
         )
 
     def _folder(self, setting: Setting) -> Path:
