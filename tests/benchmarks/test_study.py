@@ -13,30 +13,11 @@ from benchmarks.quality.protocol.results import Results
 from benchmarks.quality.protocol.split import SplitConfig, paper_split, split_of
 from benchmarks.quality.protocol.study import Study, StudyConfig
 
-from rf3dgs.channel.io import PathsWriter
 from rf3dgs.core.errors import DataError, InputError, SealedError
-from rf3dgs.core.frames import Pose
 from rf3dgs.evaluation.scores import SCORE
-from rf3dgs.propagation.room import shoebox
 from rf3dgs.spectra.codec import DbWindow
 
 RECEIVERS = 40
-"""In a room whose paths are exact."""
-TX = Pose((0.6, 0.8, 2.4))
-
-
-def places() -> torch.Tensor:
-    generator = torch.Generator().manual_seed(3)
-    return torch.tensor([0.8, 0.8, 1.2]) + torch.tensor([8.0, 7.0, 0.5]) * torch.rand(RECEIVERS, 3, generator=generator)
-
-
-@pytest.fixture(scope="module")
-def paths(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("room") / "room.h5"
-    with PathsWriter(folder, 60e9, TX) as writer:
-        for place in places():
-            writer.append(shoebox((10.0, 9.0, 3.0), TX, Pose(place), 60e9, order=1))
-    return folder
 
 
 def config(paths, out, **changes) -> StudyConfig:
@@ -45,8 +26,8 @@ def config(paths, out, **changes) -> StudyConfig:
     return StudyConfig("lobby", "diffuse", out, **(values | changes))
 
 
-def test_all_pictures_of_a_position_are_on_one_side(paths, tmp_path):
-    study = Study(config(paths, tmp_path))
+def test_all_pictures_of_a_position_are_on_one_side(room_paths, tmp_path):
+    study = Study(config(room_paths, tmp_path))
     roles = np.array(study.data.dataset.roles).reshape(RECEIVERS, 4)
     assert bool((roles == roles[:, :1]).all())
     train = study.task(5, 0, geometry=False).spectra
@@ -56,16 +37,16 @@ def test_all_pictures_of_a_position_are_on_one_side(paths, tmp_path):
     assert float(apart.min()) > 1e-3
 
 
-def test_the_paper_split_tests_a_fifth_and_trains_on_the_rest():
-    split = paper_split(places())
+def test_the_paper_split_tests_a_fifth_and_trains_on_the_rest(room_places):
+    split = paper_split(room_places)
     assert len(split.where("test")) == RECEIVERS // 5
     assert len(split.where("pool")) == RECEIVERS - RECEIVERS // 5
     few, more = (set(split.training(count, 1).tolist()) for count in (8, 16))
     assert few < more
 
 
-def test_clustered_positions_lie_closer_together_than_uniform_ones_and_are_nested():
-    split, ground = paper_split(places()), places()[:, :2].double().numpy()
+def test_clustered_positions_lie_closer_together_than_uniform_ones_and_are_nested(room_places):
+    split, ground = paper_split(room_places), room_places[:, :2].double().numpy()
 
     def alone(which: np.ndarray) -> float:
         """How far the farthest position of the room is from a training position [m]."""
@@ -76,24 +57,24 @@ def test_clustered_positions_lie_closer_together_than_uniform_ones_and_are_neste
     assert set(split.training(8, 0, "clustered", ground)) < set(clustered)
 
 
-def test_a_region_keeps_its_buffer():
-    split = split_of(places(), SplitConfig(6, 6, 4, 4, buffer=0.4))
-    ground = places()[:, :2]
+def test_a_region_keeps_its_buffer(room_places):
+    split = split_of(room_places, SplitConfig(6, 6, 4, 4, buffer=0.4))
+    ground = room_places[:, :2]
     for part in ("region", "validation region"):
         inside = ground[torch.from_numpy(split.where(part))]
         pool = ground[torch.from_numpy(split.where("pool"))]
         assert float(torch.cdist(inside, pool).min()) > 0.4
 
 
-def test_two_receivers_at_one_place_are_refused():
-    twice = places()
+def test_two_receivers_at_one_place_are_refused(room_places):
+    twice = room_places.clone()
     twice[7] = twice[3]
     with pytest.raises(InputError, match="two receivers stand at one place"):
         split_of(twice, SplitConfig(6, 6, 4, 4))
 
 
-def test_a_held_out_position_among_the_training_ones_is_refused(paths, tmp_path):
-    study = Study(config(paths, tmp_path))
+def test_a_held_out_position_among_the_training_ones_is_refused(room_paths, tmp_path):
+    study = Study(config(room_paths, tmp_path))
     leak = study.truth("random").spectra[:4]
 
     class Leaky(Study):
@@ -107,20 +88,20 @@ def test_a_held_out_position_among_the_training_ones_is_refused(paths, tmp_path)
         return stack_spectra([part[index] for part in (one, other) for index in range(len(part))])
 
     results = Results(["nearest"], "validation", "photos", [0])
-    Leaky(config(paths, tmp_path)).add(results, methods_of(["nearest"]), 5, 0)
+    Leaky(config(room_paths, tmp_path)).add(results, methods_of(["nearest"]), 5, 0)
     assert not results.places  # its cells stay empty
 
 
-def test_the_sealed_positions_raise_without_their_flag(paths, tmp_path):
-    study = Study(config(paths, tmp_path))
+def test_the_sealed_positions_raise_without_their_flag(room_paths, tmp_path):
+    study = Study(config(room_paths, tmp_path))
     for read in (lambda: study.data.dataset.test, lambda: study.data.dataset.spectra):
         with pytest.raises(SealedError):
             read()
     assert not (tmp_path / "data" / "lobby-diffuse" / "dataset" / "test_reads.log").exists()
 
 
-def test_cells_say_what_was_seen_and_a_cell_that_saw_other_views_is_refused(paths, tmp_path):
-    results, study = Results(["nearest", "idw4"], "validation", "photos", [0]), Study(config(paths, tmp_path))
+def test_cells_say_what_was_seen_and_a_cell_that_saw_other_views_is_refused(room_paths, tmp_path):
+    results, study = Results(["nearest", "idw4"], "validation", "photos", [0]), Study(config(room_paths, tmp_path))
     study.add(results, methods_of(["nearest", "idw4"]), 5, 0)
     assert results.positions(results.places[0]) == 4
     assert results.estimate(results.places[0], "nearest", SCORE["psnr"]) is not None
@@ -132,11 +113,11 @@ def test_cells_say_what_was_seen_and_a_cell_that_saw_other_views_is_refused(path
         results.add(key, cell)
 
 
-def test_a_study_of_another_scale_makes_its_own_cells(paths, tmp_path):
+def test_a_study_of_another_scale_makes_its_own_cells(room_paths, tmp_path):
     results = Results(["nearest"], "validation", "photos", [0])
-    Study(config(paths, tmp_path)).add(results, methods_of(["nearest"]), 5, 0)
+    Study(config(room_paths, tmp_path)).add(results, methods_of(["nearest"]), 5, 0)
     file = next((tmp_path / "cells").rglob("*.json"))
-    study = Study(config(paths, tmp_path, scale="paper"))
+    study = Study(config(room_paths, tmp_path, scale="paper"))
     assert read_cell(file, study.base | {"model": "nearest"}) is None
 
 

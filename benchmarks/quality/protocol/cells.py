@@ -7,7 +7,6 @@ same is never made again.
 import json
 import math
 import os
-import platform
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
@@ -26,7 +25,7 @@ from rf3dgs.channel.arrays import planar_array
 from rf3dgs.core.files import write_whole
 from rf3dgs.evaluation import beams
 from rf3dgs.evaluation.protocol import Predictor, refuse_leak, score
-from rf3dgs.evaluation.provenance import versions
+from rf3dgs.evaluation.provenance import processor, versions
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
@@ -195,13 +194,8 @@ def commit() -> str:
 
 def machine() -> str:
     """The processor and its cores, and the GPU where there is one."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="ascii").splitlines()
-    except OSError:
-        lines = []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
     gpu = f", {torch.cuda.get_device_name()}" if torch.cuda.is_available() else ""
-    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores{gpu}"
+    return f"{processor()}, {os.cpu_count()} cores{gpu}"
 
 
 def reset_peak() -> None:

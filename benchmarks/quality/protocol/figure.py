@@ -13,7 +13,7 @@ from benchmarks.quality.methods.method import SCALES, Scale
 from benchmarks.quality.protocol.cells import commit, machine
 from benchmarks.quality.protocol.pictures import Pictures, pinholes
 from benchmarks.quality.protocol.split import SplitConfig
-from benchmarks.quality.protocol.study import Study, StudyConfig
+from benchmarks.quality.protocol.study import Study, StudyConfig, say
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.files import write_whole
 from rf3dgs.spectra.config import Method as SpectrumMethod
@@ -132,6 +132,17 @@ def put_into(page: Path, name: str, text: str) -> None:
             f"{page} has no marks <!-- {name} --> and <!-- end of {name} -->; add them where tables belong"
         )
     write_whole(page, f"{head}{mark}\n{text}\n\n{end}{tail}".encode())
+
+
+def page_or_sentence(page: Path | None, name: str, text: str) -> int:
+    """Put a figure's text into a page where one is named; the exit status, after a sentence where that failed."""
+    try:
+        if page is not None:
+            put_into(page, name, text)
+    except (OSError, InputError) as error:
+        say(f"{name}: {error}")
+        return 2
+    return 0
 
 
 def rows_of(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
