@@ -10,7 +10,7 @@ LEVELS = torch.arange(256) / 255.0
 def test_a_level_comes_back_from_its_colour():
     picture = jet_picture(LEVELS)
     assert torch.equal(picture, (picture * 255).round() / 255)
-    # three neighbours that have one colour in 8 bits cannot be told apart
+    # of five neighbours that have one colour in 8 bits the middle one comes back
     assert float((jet_level(picture) - LEVELS).abs().max()) <= 2.001 / 255
     assert len(picture.unique(dim=0)) >= 250
 

@@ -27,11 +27,10 @@ def jet_picture(level: Tensor) -> Tensor:
 def jet_level(picture: Tensor) -> Tensor:
     """Levels `[*shape]` in 0..1 of colours `[*shape, 3]`: each that of the nearest of the map's colours.
 
-    The map stands still near 0.12 and 0.9, where up to three neighbours have one colour in 8 bits: a level may come back
-    2/255 off.
+    Near 0.12 the map stands still: five neighbours have one colour, which is read as the middle one.
     """
-    _, nearest = _tree().query(picture.detach().double().numpy())
-    return torch.from_numpy(np.asarray(nearest) / (LEVELS - 1.0)).float()
+    tree, levels = _nearest()
+    return torch.from_numpy(levels[tree.query(picture.detach().double().numpy())[1]]).float()
 
 
 def jet_steepness(level: Tensor) -> Tensor:
@@ -51,8 +50,10 @@ def _palette() -> np.ndarray:
 
 
 @cache
-def _tree() -> KDTree:
-    return KDTree(_palette())
+def _nearest() -> tuple[KDTree, np.ndarray]:
+    """The map's distinct colours, to be searched, and the mean level of each."""
+    colours, which, count = np.unique(_palette(), axis=0, return_inverse=True, return_counts=True)
+    return KDTree(colours), np.bincount(which.ravel(), weights=np.linspace(0.0, 1.0, LEVELS)) / count
 
 
 @cache
