@@ -9,9 +9,7 @@ window that the user supplies; delay and departure are not in them.
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from rf3dgs.core.errors import DataError, InputError
@@ -22,6 +20,7 @@ from rf3dgs.data.formats.colmap import read_colmap
 from rf3dgs.data.photo import PhotoSet
 from rf3dgs.data.safe import read_text
 from rf3dgs.spectra.codec import DbWindow
+from rf3dgs.spectra.jet import jet_level
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 
 INDEX_FILES = {"train": "train_index.txt", "test": "test_index.txt"}
@@ -89,8 +88,4 @@ def level_of(picture: Tensor) -> Tensor:
     """Levels `[row, col]`, 0 to 1, of a grey picture or of one in jet colours `[row, col, 3]`."""
     if bool((picture - picture[..., :1]).abs().max() < 2.5 / 255):
         return picture[..., 0]
-    from matplotlib import colormaps
-
-    palette = colormaps["jet"](np.linspace(0.0, 1.0, 256))[:, :3]
-    _, nearest = KDTree(palette).query(picture.double().numpy())
-    return torch.from_numpy(nearest / 255.0).float()
+    return jet_level(picture)

@@ -1,12 +1,37 @@
-"""What a field must beat: predictors that copy the training spectra."""
+"""What a field must beat: predictors that copy the training spectra, know one path, or follow the published recipe."""
 
 from typing import TYPE_CHECKING
 
 from rf3dgs.core.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from rf3dgs.evaluation.baselines.constant import Constant as Constant
+    from rf3dgs.evaluation.baselines.interpolation import LinearInterpolation as LinearInterpolation
+    from rf3dgs.evaluation.baselines.line_of_sight import LineOfSight as LineOfSight
     from rf3dgs.evaluation.baselines.lookup import InverseDistance as InverseDistance
     from rf3dgs.evaluation.baselines.lookup import NearestNeighbour as NearestNeighbour
+    from rf3dgs.evaluation.baselines.published import PublishedConfig as PublishedConfig
+    from rf3dgs.evaluation.baselines.published import PublishedField as PublishedField
+    from rf3dgs.evaluation.baselines.published import fit_published as fit_published
 
-__all__ = ["NearestNeighbour", "InverseDistance"]  # noqa: RUF022
-__getattr__, __dir__ = lazy_names(__name__, {"NearestNeighbour": ".lookup", "InverseDistance": ".lookup"})
+_HOMES = {
+    "NearestNeighbour": ".lookup",
+    "InverseDistance": ".lookup",
+    "LinearInterpolation": ".interpolation",
+    "Constant": ".constant",
+    "LineOfSight": ".line_of_sight",
+    "fit_published": ".published",
+    "PublishedConfig": ".published",
+    "PublishedField": ".published",
+}
+__all__ = [  # noqa: RUF022 (reading order)
+    "NearestNeighbour",
+    "InverseDistance",
+    "LinearInterpolation",
+    "Constant",
+    "LineOfSight",
+    "fit_published",
+    "PublishedConfig",
+    "PublishedField",
+]
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)
