@@ -1,8 +1,8 @@
 """Clustered delay lines of 3GPP TR 38.901 (V16.1): what a channel is like on average, without any site.
 
 A profile's clusters are 20 rays each. They are scaled to a K-factor, a delay spread and four angle spreads, and turned
-so that the line of sight, or the mean direction where there is none, is the true one (section 7.7). Rays are powers with
-random phases: the tables' cross-polarisation is not used, since a path's gain is summed over polarisations here.
+so that the line of sight, or the mean direction where there is none, is the true one (section 7.7). Rays have random
+phases; the tables' cross-polarisation is not used, since a path's gain is summed over polarisations here.
 """
 
 import math
