@@ -4,6 +4,7 @@ A cell holds every position's scores, what it cost, and what it was made from; o
 same is never made again.
 """
 
+import io
 import json
 import math
 import os
@@ -23,6 +24,7 @@ from benchmarks.quality.methods.method import Method, Task
 from benchmarks.quality.protocol.split import Draw
 from rf3dgs.channel.arrays import planar_array
 from rf3dgs.core.files import write_whole
+from rf3dgs.core.npz import read_npz_array
 from rf3dgs.evaluation import beams
 from rf3dgs.evaluation.protocol import Predictor, refuse_leak, score
 from rf3dgs.evaluation.provenance import processor, versions
@@ -124,8 +126,9 @@ def make_cells(
     truths: Mapping[str, Truth],
     identity: Mapping[str, Any],
     folder: Path,
+    keep: int = 0,
 ) -> None:
-    """Train a method once and write the cells `keys`, which differ in the hold-out alone."""
+    """Train a method once and write the cells `keys`, which differ in the hold-out alone; `keep` pictures stay."""
     train = task.spectra
     for key in keys:
         refuse_leak(train.pose.position, truths[key.holdout].spectra.pose.position)
@@ -141,8 +144,22 @@ def make_cells(
         drawn = truth.drawn(predictor)
         rendering = clock.lap() | {"pictures": len(drawn)}
         values = truth.scored(drawn)
+        if keep:
+            buffer = io.BytesIO()
+            np.savez_compressed(buffer, power=drawn.power[:keep].numpy())
+            write_whole(kept_path(key, folder), buffer.getvalue())
         saw = {"trained": views_digest(train), "judged": views_digest(truth.spectra)}
         _write(key, values, identity, facts | {"rendering": rendering, "views": truth.views, "saw": saw}, folder)
+
+
+def kept_path(key: Key, folder: Path) -> Path:
+    """The file of the pictures that were kept of a cell."""
+    return key.path(folder).with_suffix(".npz")
+
+
+def kept(key: Key, folder: Path) -> np.ndarray:
+    """The power `[n, row, col]` of the pictures that were kept of a cell."""
+    return read_npz_array(kept_path(key, folder), "power")
 
 
 def views_digest(spectra: Spectrum) -> str:

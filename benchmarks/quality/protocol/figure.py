@@ -69,6 +69,7 @@ def study_of(
     method: SpectrumMethod = "ideal",
     pictures: Pictures | None = None,
     holdouts: Sequence[str] = ("random", "region"),
+    keep: int = 0,
 ) -> Study:
     """The study of the lobby at the asked scale, seen by four pinholes a position unless `pictures` says otherwise.
 
@@ -94,6 +95,7 @@ def study_of(
             geometry_folder=wish.out / "geometry",
             mesh_count=size.mesh_count,
             scale=wish.scale,
+            keep=keep,
             paths={} if wish.paths is None else {PRESET: wish.paths},
             reason=lambda: f"benchmarks.quality.{name} at {commit()}, scale {wish.scale}",
         )

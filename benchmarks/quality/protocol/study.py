@@ -11,10 +11,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 
 from benchmarks.quality.methods.method import Method, Scale, Task
-from benchmarks.quality.protocol.cells import SECOND, Key, Truth, make_cells, make_second, read_cell
+from benchmarks.quality.protocol.cells import SECOND, Key, Truth, kept, kept_path, make_cells, make_second, read_cell
 from benchmarks.quality.protocol.data import Data, data_of, geometry_digest, geometry_of, second_solve, spectra_at
 from benchmarks.quality.protocol.pictures import SPHERE, Pictures
 from benchmarks.quality.protocol.results import Results
@@ -61,6 +62,8 @@ class StudyConfig:
     """Folders of traced paths by preset, for the scene itself."""
     reason: Callable[[], str] = lambda: "a study"
     """Why the sealed positions are read, for the log."""
+    keep: int = 0
+    """Pictures of every cell, the first ones of its hold-out, that are kept beside it."""
     only_read: bool = False
     """Make no cell."""
 
@@ -174,18 +177,31 @@ class Study:
             "scale": config.scale,
             "geometry": None if bare or task.geometry is None else geometry_digest(task.geometry),
         }
-        missing = [key for key in keys if again or not read_cell(key.path(config.out), identity)]
+        missing = [key for key in keys if again or not self._is_there(key, identity)]
         if missing and not config.only_read:
             say(f"{config.preset} {config.judge} {count} positions, {draw}, seed {task.seed}: {method.name}")
             truths = {key.holdout: self.truth(key.holdout) for key in missing}
             try:
-                make_cells(missing, method, task, truths, identity, config.out)
+                make_cells(missing, method, task, truths, identity, config.out, config.keep)
             except RfError as error:
                 say(f"{method.name} failed, its cells stay empty: {error}")
         for key in keys:
             found = read_cell(key.path(config.out), identity)
             if found is not None:
                 yield key, found
+
+    def _is_there(self, key: Key, identity: Mapping[str, Any]) -> bool:
+        config = self.config
+        if config.keep and not kept_path(key, config.out).is_file():
+            return False
+        return read_cell(key.path(config.out), identity) is not None
+
+    def kept(self, method: Method, holdout: str, count: int, seed: int) -> np.ndarray:
+        """The power `[n, row, col]` of the kept pictures of a cell."""
+        config = self.config
+        kind = "none" if "geometry" not in method.needs else Path(config.geometry).stem
+        key = self._key(holdout, count, seed, method.name, kind, self.before.setting.name)
+        return kept(key, config.out)
 
     def _key(self, holdout: str, count: int, seed: int, model: str, geometry: str, trained: str) -> Key:
         config = self.config

@@ -1,0 +1,224 @@
+"""The paper's Fig. 9: where PSNR and SSIM mislead.
+
+    python -m benchmarks.quality.fig9 --scale laptop --paths paper.paths
+
+Two tests of every picture score. Harmed truths: each held-out picture is changed in a way whose harm is known (its
+level, its direction, its sharpness, its strongest beam), and scored. Methods: of two methods' pictures of one view,
+does the score prefer the one whose beam loses less? docs/how-to/figures-9.md has what came out.
+"""
+
+import io
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter
+
+from benchmarks.quality.methods import known, methods_of
+from benchmarks.quality.methods.method import Scale
+from benchmarks.quality.protocol.cells import Truth
+from benchmarks.quality.protocol.figure import made_by, page_or_sentence, parser_of, rows_of, study_of, write_json
+from benchmarks.quality.protocol.results import Results
+from benchmarks.quality.protocol.study import Study, say
+from rf3dgs.core.errors import RfError
+from rf3dgs.core.files import write_whole
+from rf3dgs.core.units import db_from_power, power_from_db
+from rf3dgs.evaluation.figures import STYLE
+from rf3dgs.evaluation.pictures import coloured
+from rf3dgs.evaluation.scores import SCORE, Score
+from rf3dgs.spectra.codec import DbWindow
+
+METHODS = ("nearest", "constant", "rf3dgs-jet", "rf3dgs-db", "nerf2", "nerf2-db", "cgan", "mirror")
+POSITIONS: Mapping[Scale, int] = {"smoke": 8, "laptop": 40, "paper": 160}
+PICTURE_SCORES = ("psnr", "ssim", "flip", "lpips", "rmse_db", "wasserstein")
+PHYSICS = ("peak_median", "peak_within_1", "beam_loss_eigen", "path_gain")
+IN_PANEL = ("psnr", "ssim", "flip", "rmse_db", "peak_median", "beam_loss_eigen")
+CLEAR_DB = 1.0  # two beam losses this far apart are told apart
+Harm = Callable[[np.ndarray, np.random.Generator], np.ndarray]
+
+
+def offset(level: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    return level + 3.0
+
+
+def turned(level: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    return np.roll(level, 3, axis=1)
+
+
+def blurred(level: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    return gaussian_filter(level, 2.0, mode="nearest")
+
+
+def beamless(level: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    return np.minimum(level, level.max() - 20.0)
+
+
+def clipped(level: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    return np.minimum(level, np.percentile(level, 98.0))
+
+
+def noisy(level: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    return level + random.normal(0.0, 4.0, level.shape)
+
+
+def ghost(level: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """With a beam that is not there, 1 dB above the strongest, half a picture beside it."""
+    rows, cols = level.shape
+    row, col = np.unravel_index(level.argmax(), level.shape)
+    beside = (col + cols // 2) % cols
+    near = np.hypot(np.arange(rows)[:, None] - row, np.arange(cols) - beside) < 3
+    return np.where(near, np.maximum(level, np.roll(level, cols // 2, axis=1) + 1.0), level)
+
+
+HARMS: Mapping[str, tuple[str, Harm]] = {
+    "noise of 4 dB": ("every pixel for itself", noisy),
+    "3 dB more": ("the whole picture", offset),
+    "turned": ("by 3 columns, about 3.6 degrees at laptop", turned),
+    "blurred": ("2 pixels, in dB", blurred),
+    "peaks clipped": ("at the picture's 98th percentile", clipped),
+    "no strong beam": ("all above 20 dB below the peak cut off", beamless),
+    "ghost beam": ("a second beam, 1 dB stronger, opposite", ghost),
+}
+
+
+def harmed(truth: Truth, harm: Harm, seed: int) -> dict[str, np.ndarray]:
+    """Scores of the true pictures after one harm."""
+    spectra, random = truth.spectra, np.random.default_rng(seed)
+    floor = truth.window.floor_db
+    levels = np.stack([harm(np.maximum(db_from_power(power).numpy(), floor), random) for power in spectra.power])
+    power = power_from_db(torch.from_numpy(levels.astype(np.float32)))
+    return truth.scored(replace(spectra, power=power))
+
+
+def misorders(results: Results, holdout: str, score: Score, seed: int) -> tuple[float, int]:
+    """Of all pairs of methods at all views whose beam losses differ clearly, the share that a score orders wrongly."""
+    place = next(place for place in results.places if place.holdout == holdout)
+    names = [name for name in results.models if results.seeds(place, name)]
+    wrong = count = 0.0
+    for one, other in combinations(names, 2):
+        loss, value = (
+            results.matrix(place, one, column, [seed])[0] - results.matrix(place, other, column, [seed])[0]
+            for column in (SCORE["beam_loss_eigen"].column, score.column)
+        )
+        clear = (np.abs(loss) >= CLEAR_DB) & np.isfinite(value)
+        worse = value < 0 if score.better == "higher" else value > 0
+        wrong += float(((loss[clear] > 0) != worse[clear]).sum()) - 0.5 * float((value[clear] == 0).sum())
+        count += int(clear.sum())
+    return (100.0 * wrong / count if count else float("nan")), int(count)
+
+
+def panels(truth: Truth, rows: Sequence[tuple[str, np.ndarray, Mapping[str, float]]], shown: Sequence[Score]) -> bytes:
+    """One view as PNG: the truth, harmed truths and methods, each with its scores."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    window = window_of_view(truth)
+    with mpl.rc_context({**STYLE, "font.size": 7}):
+        columns = 4
+        figure = Figure(figsize=(10.6, 2.35 * -(-len(rows) // columns)), dpi=100, layout="constrained")
+        axes = figure.subplots(-(-len(rows) // columns), columns, squeeze=False).ravel()
+        for axis in axes:
+            axis.set_axis_off()
+        for axis, (name, power, values) in zip(axes, rows, strict=False):
+            axis.imshow(coloured(window.encode(torch.from_numpy(np.array(power))).numpy()), interpolation="nearest")
+            axis.set_title(f"{name}
+{caption(values, shown)}")
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def caption(values: Mapping[str, float], shown: Sequence[Score]) -> str:
+    """The scores in two lines."""
+    texts = [f"{one.label} {one.text(values[one.column])} {one.unit}".rstrip() for one in shown if one.column in values]
+    return f"{', '.join(texts[:3])}\n{', '.join(texts[3:])}"
+
+
+def window_of_view(truth: Truth) -> DbWindow:
+    level = db_from_power(truth.spectra.power).numpy()
+    top = float(np.ceil(level.max()))
+    return DbWindow(max(truth.window.floor_db, top - 60.0), top)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    parser = parser_of(__doc__, "fig9")
+    parser.add_argument("--methods", nargs="+", help="names, Python files; all of METHODS that there are when missing")
+    parser.add_argument("--seed", type=int, default=0)
+    wish = parser.parse_args(words)
+    names = wish.methods or [name for name in METHODS if name in known()]
+    count = POSITIONS[wish.scale]
+    try:
+        methods = methods_of(names)
+        study = study_of(wish, "fig9", holdouts=("random",), keep=1_000_000)
+        judge = "test" if wish.read_test else "validation"
+        results = Results([method.name for method in methods], judge, Path(study.config.geometry).stem, [wish.seed])
+        study.add(results, methods, count, wish.seed)
+        truth = study.truth("random")
+    except RfError as error:
+        say(f"fig9: {error}")
+        return 2
+    pictures, physics = ([SCORE[key] for key in keys if key in SCORE] for keys in (PICTURE_SCORES, PHYSICS))
+    found = {name: harmed(truth, harm, wish.seed) for name, (_, harm) in HARMS.items()}
+    place = results.places[0]
+    fitted = {name: results.values[place][name][wish.seed] for name in results.models if name in results.values[place]}
+    head = ["", *(f"{score.label} [{score.unit}]" if score.unit else score.label for score in (*pictures, *physics))]
+
+    def row(name: str, values: Mapping[str, np.ndarray]) -> list[str]:
+        return [name, *(score.text(score.of(values[score.column])) for score in (*pictures, *physics))]
+
+    shares = {score.key: misorders(results, "random", score, wish.seed) for score in (*pictures, SCORE["peak_median"])}
+    orders = [[SCORE[key].label, f"{share:.0f} %", str(pairs)] for key, (share, pairs) in shares.items()]
+    text = "\n\n".join(
+        [
+            f"**Harmed truths**, {len(truth.spectra)} pictures",
+            rows_of(head, [row(f"{name}: {HARMS[name][0]}", values) for name, values in found.items()]),
+            f"**Methods**, {count} training positions, the same pictures",
+            rows_of(head, [row(name, values) for name, values in fitted.items()]),
+            f"**Pairs of methods at one view** whose eigenbeam losses differ by at least {CLEAR_DB:g} dB: how often "
+            "the score prefers the one that loses more (50 % is a coin)",
+            rows_of(["score", "prefers the worse", "pairs"], orders),
+            made_by("fig9", [wish.seed], words),
+        ]
+    )
+    draw(study, truth, methods, found, fitted, count, wish)
+    numbers = {"harmed": found, "methods": fitted, "misorders": shares, "facts": results.facts}
+    write_json(wish.out / f"fig9-{wish.scale}.json", plain(numbers))
+    print(text)
+    return page_or_sentence(wish.page, "fig9", text)
+
+
+def plain(value):
+    """Arrays as lists, for JSON."""
+    if isinstance(value, Mapping):
+        return {key: plain(one) for key, one in value.items()}
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def draw(study: Study, truth: Truth, methods, found, fitted, count: int, wish) -> None:
+    """The panels of the view whose strongest beam stands out most among those kept."""
+    level = db_from_power(truth.spectra.power).flatten(1)
+    view = int((level.amax(1) - level.median(1).values).argmax())
+    one = truth.spectra.power[view].numpy()
+    random = np.random.default_rng(wish.seed)
+    floor = truth.window.floor_db
+    rows: list[tuple[str, np.ndarray, Mapping[str, float]]] = [("truth", one, {})]
+    shown = [
+        SCORE[key] for key in ("psnr", "ssim", "flip", "rmse_db", "peak_median", "beam_loss_eigen") if key in SCORE
+    ]
+    for name, (_, harm) in HARMS.items():
+        harmed_level = harm(np.maximum(db_from_power(truth.spectra.power[view]).numpy(), floor), random)
+        values = {column: float(value[view]) for column, value in found[name].items()}
+        rows.append((name, power_from_db(torch.from_numpy(harmed_level)).numpy(), values))
+    for method in methods:
+        if method.name in fitted:
+            values = {column: float(value[view]) for column, value in fitted[method.name].items()}
+            rows.append((method.name, study.kept(method, "random", count, wish.seed)[view], values))
+    write_whole((wish.pictures or wish.out) / f"fig9-{wish.scale}.png", panels(truth, rows, shown))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
