@@ -174,3 +174,10 @@ def test_psnr_of_a_gain_offset_is_the_offset_as_a_share_of_the_window(answers):
     values, _, window = answers
     expected = -20 * math.log10(OFFSET_DB / window.span_db)
     assert values["offset"]["psnr"] == pytest.approx(expected, abs=1e-3)
+
+
+def test_psnr_prefers_a_sky_that_is_turned_to_one_that_is_too_bright(answers):
+    """What `docs/how-to/metrics.md` says of it: the beam knows better."""
+    values = answers[0]
+    assert values["shifted"]["psnr"] > values["offset"]["psnr"] + 1
+    assert values["shifted"]["beam_loss_peak"] > values["offset"]["beam_loss_peak"] + 3

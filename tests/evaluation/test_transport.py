@@ -89,7 +89,7 @@ def test_it_is_a_lower_bound_of_the_best_transport_and_near_it(room):
         exact = best_transport((first / first.sum()).numpy(), (second / second.sum()).numpy(), cost)
         ratios.append(float(found[index]) / exact)
     assert max(ratios) <= 1 + 1e-5
-    assert min(ratios) > 0.7  # three quarters in the worst of a dozen random skies
+    assert min(ratios) > 0.7  # rooms like this one; skies of many lobes that all move differently fall lower
 
 
 def test_neither_a_gain_nor_a_faint_floor_changes_it_and_the_order_does_not_matter(room):
