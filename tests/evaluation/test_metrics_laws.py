@@ -9,7 +9,7 @@ import torch
 from rf3dgs.channel.arrays import planar_array
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import equirect_grid
+from rf3dgs.core.grids import equirect_grid, pinhole_grid
 from rf3dgs.evaluation.beams import panel_covariance
 from rf3dgs.evaluation.metrics import is_distinct, peak_direction
 from rf3dgs.evaluation.protocol import score
@@ -174,6 +174,28 @@ def test_psnr_of_a_gain_offset_is_the_offset_as_a_share_of_the_window(answers):
     values, _, window = answers
     expected = -20 * math.log10(OFFSET_DB / window.span_db)
     assert values["offset"]["psnr"] == pytest.approx(expected, abs=1e-3)
+
+
+def test_pinhole_pictures_obey_the_same_laws(room, random_lpips):
+    grid = pinhole_grid(48, 36, fov_deg=90)
+    towards = receivers_that_look_at_the_transmitter(room)
+    truth = room.spectra_at(towards, grid)
+    sign = torch.tensor([1.0, -1.0, 1.0, -1.0])[:, None, None]
+    offset = replace(truth, power=truth.power * 10 ** (sign * OFFSET_DB / 10))
+    levels = truth.gain_db
+    window = DbWindow(float(levels.min()) - 5.0, float(levels.max()) + 5.0)
+    covariance, lpips = panel_covariance(truth, ARRAY), random_lpips("alex")
+    for case, prediction in (("perfect", truth), ("offset", offset)):
+        found = score(truth, prediction, covariance, window, ARRAY, lpips)
+        for one in SCORES:
+            value = one.of(found[one.column])
+            assert getattr(LAWS[one.key], case).holds(value), f"{one.key} of {case} is {value}"
+
+
+def receivers_that_look_at_the_transmitter(room) -> Pose:
+    position = room.receivers(4, seed=2).position
+    away = room.tx - position
+    return Pose.from_yaw(position, torch.atan2(away[:, 1], away[:, 0]))
 
 
 def test_psnr_prefers_a_sky_that_is_turned_to_one_that_is_too_bright(answers):
