@@ -10,6 +10,7 @@ import torch
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid
+from rf3dgs.evaluation.lpips import Lpips
 from rf3dgs.spectra.spectrum import Instrument, Spectrum, stack_spectra
 
 GRID = equirect_grid(48, 24)
@@ -55,6 +56,40 @@ class Oracle:
     def render(self, pose: Pose, grid: DirectionGrid) -> Spectrum:
         spectrum = spectrum_at(pose, grid, noise_db=self.noise_db, seed=99)
         return replace(spectrum, power=spectrum.power * 10 ** (self.offset_db / 10))
+
+
+CHANNELS = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
+LAYERS = {  # (index in the published state dict, inputs, outputs, side) of each convolution
+    "alex": ((0, 3, 64, 11), (3, 64, 192, 5), (6, 192, 384, 3), (8, 384, 256, 3), (10, 256, 256, 3)),
+    "vgg": (
+        *((0, 3, 64, 3), (2, 64, 64, 3), (5, 64, 128, 3), (7, 128, 128, 3), (10, 128, 256, 3), (12, 256, 256, 3)),
+        *((14, 256, 256, 3), (17, 256, 512, 3), (19, 512, 512, 3), (21, 512, 512, 3), (24, 512, 512, 3)),
+        *((26, 512, 512, 3), (28, 512, 512, 3)),
+    ),
+}
+
+
+def random_weights(network: str) -> dict[str, torch.Tensor]:
+    """A backbone ("alex", "vgg") and heads that were never trained, named as in the published files."""
+    generator = torch.Generator().manual_seed(3)
+    weights = {}
+    for index, inputs, outputs, size in LAYERS[network]:
+        shape = (outputs, inputs, size, size)
+        weights[f"features.{index}.weight"] = torch.randn(shape, generator=generator) * (2 / (inputs * size**2)) ** 0.5
+        weights[f"features.{index}.bias"] = 0.1 * torch.randn(outputs, generator=generator)
+    for head, channels in enumerate(CHANNELS[network]):
+        weights[f"lin{head}.model.1.weight"] = torch.rand(1, channels, 1, 1, generator=generator)
+    return weights
+
+
+@pytest.fixture(scope="session", name="random_weights")
+def random_weights_fixture():
+    return random_weights
+
+
+@pytest.fixture(scope="session")
+def random_lpips():
+    return lambda network: Lpips(random_weights(network))
 
 
 @pytest.fixture(scope="session")

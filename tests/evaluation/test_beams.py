@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 
+import pytest
 import torch
 
 from rf3dgs.channel.arrays import planar_array
@@ -8,6 +9,7 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import pinhole_grid
 from rf3dgs.evaluation import beams
 from rf3dgs.spectra.covariance import covariance_of_spectrum
+from rf3dgs.spectra.spectrum import Instrument, Spectrum
 
 ARRAY = planar_array(8, 8, pattern="patch")
 
@@ -41,6 +43,24 @@ def test_a_beam_towards_the_wrong_side_loses_its_gain(room):
     mirrored = replace(truth, power=truth.power.roll(16, -1))
     assert bool((beams.beam_loss_peak(truth, mirrored, covariance, ARRAY) > 6).all())
     assert bool((beams.beam_loss_eigen(covariance, beams.panel_covariance(mirrored, ARRAY)) > 3).all())
+
+
+def test_the_loss_of_a_beam_beside_a_single_wave_is_the_array_factor():
+    """8x8 isotropic elements half a wavelength apart: 20 log10 of sin(4 pi u) / (8 sin(pi u / 2)), across and up."""
+    grid = pinhole_grid(40, 30, fov_deg=90)
+    array = planar_array(8, 8, pattern="isotropic")
+    power = torch.zeros(2, *grid.shape)
+    power[0, 15, 20] = power[1, 13, 22] = 1e-9
+    lobe = Instrument.gaussian(math.radians(3))
+    truth, prediction = (Spectrum(one, grid, Pose((0.0, 0, 0)), 60e9, lobe) for one in power)
+    covariance = beams.panel_covariance(truth, array)
+    u = (grid.directions[13, 22] - grid.directions[15, 20])[1:].double()
+    factor = torch.sin(4 * math.pi * u) / (8 * torch.sin(math.pi * u / 2))
+    expected = float(-20 * torch.log10(factor.abs()).sum())
+    assert 1 < expected < 6
+    assert float(beams.beam_loss_peak(truth, prediction, covariance, array)) == pytest.approx(expected, abs=1e-4)
+    eigen = beams.beam_loss_eigen(covariance, beams.panel_covariance(prediction, array))
+    assert float(eigen) == pytest.approx(expected, abs=1e-4)
 
 
 def test_a_slightly_shifted_peak_loses_little_and_more_when_shifted_more(room):

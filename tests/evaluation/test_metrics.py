@@ -66,6 +66,42 @@ def test_a_gain_offset_is_an_offset_and_leaves_directions_alone(room):
     torch.testing.assert_close(metrics.psnr(first, second, weight), torch.full((2,), -20 * math.log10(3 / 200)))
 
 
+def test_an_error_in_half_of_the_sky_has_its_closed_form():
+    grid = equirect_grid(36, 18)
+    weight = metrics.pixel_weight(grid)
+    truth = torch.full(grid.shape, 1e-10)
+    half = truth.clone()
+    half[:, :18] *= 10**0.6
+    wide = DbWindow(-150.0, -50.0)
+    assert float(metrics.rmse_db(truth, half, wide, weight)) == pytest.approx(6 / math.sqrt(2), abs=1e-4)
+    assert float(metrics.mae_db(truth, half, wide, weight)) == pytest.approx(3.0, abs=1e-4)
+    low = DbWindow(-150.0, -98.0)  # ends 2 dB above the truth, so that only two of the six are seen
+    assert float(metrics.rmse_db(truth, half, low, weight)) == pytest.approx(2 / math.sqrt(2), abs=1e-4)
+    assert float(metrics.mae_db(truth, half, low, weight)) == pytest.approx(1.0, abs=1e-4)
+    high = DbWindow(-90.0, -50.0)  # both are below its floor
+    assert float(metrics.rmse_db(truth, half, high, weight)) == 0.0
+
+
+@pytest.mark.parametrize("grid", [equirect_grid(180, 90), pinhole_grid(90, 60, fov_deg=90)], ids=["sphere", "pinhole"])
+def test_the_path_gain_of_lobes_is_the_sum_of_their_gains(grid):
+    """The beam's solid angle is that of a flat Gaussian; on the sphere it holds lobe^2 / (24 ln 2), 0.3 %, less."""
+    one, two = lobe_at(1.5, 0.1, grid, level_db=-80.0), lobe_at(1.6, -0.2, grid, level_db=-84.0)
+    both = replace(one, power=one.power + two.power - 2e-13)
+    total = 10 * math.log10(1e-8 + 10**-8.4)
+    assert 10 * math.log10(float(both.path_gain)) == pytest.approx(total, abs=0.02)
+    error = total + 80.0
+    assert float(metrics.path_gain_error(both, replace(one, power=one.power - 1e-13))) == pytest.approx(error, abs=0.01)
+
+
+def test_the_mean_delay_error_has_its_closed_form():
+    grid = equirect_grid(36, 18)
+    power = torch.full(grid.shape, 1e-9)
+    truth = Spectrum(power, grid, Pose((0.0, 0, 0)), 60e9, LOBE, delay=torch.full(grid.shape, 4e-8))
+    below = torch.arange(18)[:, None].expand(grid.shape) >= 12  # zenith above 120 degrees: a quarter of the sphere
+    late = replace(truth, delay=torch.where(below, truth.delay + 8e-9, truth.delay - 4e-9))
+    assert float(metrics.delay_error(truth, late, WINDOW)) == pytest.approx(0.25 * 8e-9 + 0.75 * 4e-9, rel=1e-4)
+
+
 def test_a_shifted_peak_is_seen_in_its_angle_across_the_seam_and_near_the_pole():
     grid = equirect_grid(120, 60)
     truth = lobe_at(1.5, math.pi - 0.03, grid)

@@ -16,6 +16,7 @@ from rf3dgs.core.errors import DataError, InputError
 
 ENVIRONMENT = "RF3DGS_LPIPS"
 LARGEST_FILE = 1 << 30  # [byte]
+LEAST_SIDE = 32  # [pixel], below which AlexNet's last layers see nothing
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 
@@ -95,7 +96,7 @@ class Lpips:
 
     @torch.no_grad()
     def __call__(self, first: Tensor, second: Tensor) -> Tensor:
-        """Distances `[n]` of pictures `[n, row, col]` (grey) or `[n, row, col, 3]` in [0, 1]; at least 64 pixels a
+        """Distances `[n]` of pictures `[n, row, col]` (grey) or `[n, row, col, 3]` in [0, 1]; at least 32 pixels a
         side.
 
         Per tap, features are normalised over their channels, their squared difference weighted by the head, summed over
@@ -118,8 +119,9 @@ def _unit(features: Tensor) -> Tensor:
 
 def _network_input(picture: Tensor) -> Tensor:
     colour = picture[..., None].expand(*picture.shape, 3) if picture.dim() == 3 else picture
-    if min(colour.shape[1:3]) < 64:
-        raise InputError(f"LPIPS needs pictures of at least 64x64 pixels; got {colour.shape[2]}x{colour.shape[1]}")
+    if min(colour.shape[1:3]) < LEAST_SIDE:
+        got = f"{colour.shape[2]}x{colour.shape[1]}"
+        raise InputError(f"LPIPS needs pictures of at least {LEAST_SIDE}x{LEAST_SIDE} pixels; got {got}")
     return 2.0 * colour.permute(0, 3, 1, 2).float() - 1.0
 
 

@@ -7,6 +7,7 @@ value that a metric has: 180 degrees for a direction, the window's floor for a l
 """
 
 import math
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -53,7 +54,7 @@ def ssim(truth: Tensor, prediction: Tensor, grid: DirectionGrid) -> Tensor:
     kernel = torch.exp(-(offsets**2) / (2 * 1.5**2))
     kernel = kernel / kernel.sum()
     batch = truth.shape[:-2]
-    first, second = (_padded(picture.reshape(-1, *grid.shape).double(), grid, 5) for picture in (truth, prediction))
+    first, second = (padded(picture.reshape(-1, *grid.shape).double(), grid, 5) for picture in (truth, prediction))
 
     def blur(picture: Tensor) -> Tensor:
         picture = torch.nn.functional.conv2d(picture[:, None], kernel[None, None, :, None])
@@ -69,10 +70,12 @@ def ssim(truth: Tensor, prediction: Tensor, grid: DirectionGrid) -> Tensor:
     return (similarity * pixel_weight(grid)).sum((-2, -1)).reshape(batch).float()
 
 
-def _padded(picture: Tensor, grid: DirectionGrid, margin: int) -> Tensor:
-    """`[n, row, col]` with `margin` more pixels on every side: around the sphere, or zeros."""
+def padded(
+    picture: Tensor, grid: DirectionGrid, margin: int, *, edge: Literal["constant", "replicate"] = "constant"
+) -> Tensor:
+    """`[n, row, col]` with `margin` more pixels on every side: around the sphere; of others zeros or the edge's own."""
     if grid.kind != "equirect":
-        return torch.nn.functional.pad(picture, (margin,) * 4)
+        return torch.nn.functional.pad(picture[None], (margin,) * 4, mode=edge)[0]
     height, width = grid.shape
     rows = torch.arange(-margin, height + margin)
     over_pole = (rows < 0) | (rows >= height)

@@ -14,8 +14,10 @@ from rf3dgs.core.grids import DirectionGrid
 from rf3dgs.core.progress import Progress, Silent
 from rf3dgs.evaluation import beams, metrics
 from rf3dgs.evaluation.baselines.lookup import InverseDistance, NearestNeighbour
-from rf3dgs.evaluation.lpips import Lpips
+from rf3dgs.evaluation.lpips import LEAST_SIDE, Lpips
+from rf3dgs.evaluation.perceptual import flip
 from rf3dgs.evaluation.table import CEILING, FIELD, Evaluation
+from rf3dgs.evaluation.transport import angular_wasserstein
 from rf3dgs.spectra.codec import DbWindow, window_of
 from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
 
@@ -89,7 +91,10 @@ def score(
     array: PlanarArray,
     lpips: Lpips | None = None,
 ) -> dict[str, np.ndarray]:
-    """All per-position values `[n]` of predictions at the truth's poses and grid; NaN where one does not apply."""
+    """All per-position values `[n]` of predictions at the truth's poses and grid; NaN where one does not apply.
+
+    LPIPS does not apply without its weights, and to pictures too small for its networks.
+    """
     weight = metrics.pixel_weight(truth.grid)
     true_picture = window.encode(truth.power)
     picture = window.encode(prediction.power)
@@ -107,9 +112,11 @@ def score(
         "delay_ns": 1e9 * metrics.delay_error(truth, prediction, window),
         "departure_deg": torch.rad2deg(metrics.departure_error(truth, prediction, window)),
         "delay_spread_ns": 1e9 * metrics.delay_spread_error(truth, prediction),
+        "wasserstein_deg": torch.rad2deg(angular_wasserstein(truth, prediction)),
         "psnr_db": metrics.psnr(true_picture, picture, weight),
         "ssim": metrics.ssim(true_picture, picture, truth.grid),
-        "lpips": nothing if lpips is None else lpips(true_picture, picture),
+        "flip": flip(true_picture, picture, truth.grid),
+        "lpips": nothing if lpips is None or min(truth.grid.shape) < LEAST_SIDE else lpips(true_picture, picture),
     }
     return {name: value.double().numpy() for name, value in values.items()}
 

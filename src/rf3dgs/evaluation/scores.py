@@ -100,12 +100,20 @@ SCORES = (
         "Absolute error of the power-weighted standard deviation of the delay.",
     ),
     Score(
+        *("wasserstein", "Angular Wasserstein", "deg", "lower", "wasserstein_deg", "mean", 2),
+        "How far power must move over the sphere, on average, to make the predicted spectrum the true one's shape.",
+    ),
+    Score(
         *("psnr", "PSNR", "dB", "higher", "psnr_db", "mean", 2),
         "Of the window's picture, pixels weighted by solid angle on a sphere.",
     ),
     Score(
         *("ssim", "SSIM", "", "higher", "ssim", "mean", 3),
         "11 x 11 Gaussian window on the window's picture, weighted by solid angle on a sphere.",
+    ),
+    Score(
+        *("flip", "FLIP", "", "lower", "flip", "mean", 3),
+        "Difference of the window's pictures to an eye that flips between them, weighted by solid angle on a sphere.",
     ),
     Score(
         *("lpips", "LPIPS", "", "lower", "lpips", "mean", 3),
