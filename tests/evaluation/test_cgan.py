@@ -176,7 +176,7 @@ def test_the_pose_is_told_by_directions_in_the_world_and_the_place_in_the_box():
 
 def test_published_sizes_belong_to_the_paper_scale():
     paper = CganConfig.for_scale("paper", pictures=80, seed=3)
-    assert paper == replace(CganConfig(), steps=16_000, seed=3)
+    assert paper == replace(CganConfig(), steps=2000, seed=3)
     assert CganConfig.for_scale("smoke").steps < CganConfig.for_scale("laptop").steps < CganConfig().steps
 
 
