@@ -19,7 +19,6 @@ def test_the_cgan_learns_from_a_task_and_says_with_which_settings():
     task = Task(spectra, DbWindow(-90.0, -60.0), seed=3, scale="smoke")
     predictor = method.made(task)
     settings = json.loads(json.dumps(method.settings(task)))
-    assert settings["seed"] == 3
     assert settings["steps"] == predictor.history[-1].step
     drawn = predictor.render(Pose((0.5, 0.5, 0.5)), grid)
     assert drawn.power.shape == grid.shape

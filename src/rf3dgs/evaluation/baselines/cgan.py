@@ -4,8 +4,8 @@ What the paper compares with as a black box (its Fig. 8). It knows nothing of wa
 """
 
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -16,7 +16,7 @@ from rf3dgs.core.errors import InputError, TrainingError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, sample_grid
 from rf3dgs.core.progress import Progress, Silent
-from rf3dgs.evaluation.baselines.cgan_config import CganConfig
+from rf3dgs.evaluation.baselines.cgan_config import LEAST_BATCH, CganConfig
 from rf3dgs.evaluation.baselines.cgan_nets import Discriminator, Generator, PoseCode
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Instrument, Spectrum, stack_spectra
@@ -34,6 +34,8 @@ class Step(NamedTuple):
     """Since the fit began, by the clock."""
     loss: float
     """The generator's: weighted verdict plus weighted mean absolute error."""
+    score: float | None
+    """What `on_step` answered; None without it."""
     discriminator: float | None
     """The discriminator's, ln 2 where it only guesses; None without one."""
     l1: float
@@ -51,7 +53,7 @@ class Cgan:
     frequency: float
     instrument: Instrument
     tx: Pose | None
-    history: tuple[Step, ...]
+    history: tuple[Step, ...] = ()
 
     def render(self, pose: Pose, grid: DirectionGrid) -> Spectrum:
         """The spectrum on `grid` at one pose, or `[n, row, col]` at n poses; no delay and no departure.
@@ -67,42 +69,62 @@ class Cgan:
                 "a GAN trained on pinhole pictures draws what lies in them; the asked grid looks beyond. Ask for a "
                 "grid inside the training pictures, or train on spheres"
             )
-        device = next(self.generator.parameters()).device
-        with torch.no_grad():
-            picture = self.generator(self.code.picture(pose.flat(), self.grid).to(device))[0, 0].cpu()
+        picture = self._drawn(pose)
         if not same:
             picture = sample_grid(picture[..., None], self.grid, grid.directions)[..., 0]
         power = self.window.decode((picture + 1) / 2)
         return Spectrum(power, grid, pose, self.frequency, self.instrument, "cgan", tx=self.tx)
 
+    def _drawn(self, pose: Pose) -> Tensor:
+        """The picture `[row, col]` of the training grid at one pose, -1 to 1."""
+        device, training = next(self.generator.parameters()).device, self.generator.training
+        self.generator.eval()
+        with torch.no_grad():
+            picture = self.generator(self.code.picture(pose.flat(), self.grid).to(device))[0, 0].cpu()
+        self.generator.train(training)
+        return picture
 
-def fit_cgan(train: Spectrum, config: CganConfig, window: DbWindow, progress: Progress | None = None) -> Cgan:
+
+OnStep = Callable[[int, Cgan], float | None]
+
+
+def fit_cgan(
+    train: Spectrum,
+    config: CganConfig,
+    window: DbWindow,
+    progress: Progress | None = None,
+    on_step: OnStep | None = None,
+) -> Cgan:
     """Train on pictures `[picture, row, col]`, pinholes or spheres of 8 pixels or more each way, in `window`.
 
-    Pictures of one position count one by one. Delay and departure are not learned. InputError for spectra without a
+    Pictures of one position count one by one. Delay and departure are not learned. `on_step(done, cgan)` is called at
+    every record of the curve; its answer, a held-out score or None, is kept there. InputError for spectra without a
     pose axis or on a list of directions; TrainingError where the loss is no longer finite.
     """
     _check(train)
     device = _device(config)
     position = train.pose.position
     code = PoseCode(position.amin(0), position.amax(0), config.octaves)
-    targets = (2 * window.encode(train.power) - 1)[:, None].to(device)
     with torch.random.fork_rng():
         torch.manual_seed(config.seed)
         generator = Generator(code.channels, config, train.grid).to(device)
-        history = _train(generator, train, code, targets, config, Silent() if progress is None else progress)
+        cgan = Cgan(generator, code, train.grid, window, train.frequency, train.instrument, train.tx)
+        history = _train(cgan, train, config, Silent() if progress is None else progress, on_step)
     generator.eval()
-    return Cgan(generator, code, train.grid, window, train.frequency, train.instrument, train.tx, history)
+    return replace(cgan, history=history)
 
 
 def _train(
-    generator: Generator, train: Spectrum, code: PoseCode, targets: Tensor, config: CganConfig, progress: Progress
+    cgan: Cgan, train: Spectrum, config: CganConfig, progress: Progress, on_step: OnStep | None
 ) -> tuple[Step, ...]:
-    """Train in place; what returns is the curve."""
-    batch = max(1, config.pixels // targets[0].numel())
+    """Train the generator in place; what returns is the curve."""
+    generator, code = cgan.generator, cgan.code
+    device = next(generator.parameters()).device
+    targets = (2 * cgan.window.encode(train.power) - 1)[:, None].to(device)
+    batch = max(LEAST_BATCH, config.pixels // targets[0].numel())
     critic, judging = None, None
     if config.adversarial > 0:
-        critic = Discriminator(code.channels, config, train.grid).to(targets.device)
+        critic = Discriminator(code.channels, config, train.grid).to(device)
         judging = torch.optim.Adam(critic.parameters(), config.lr, config.betas)
     drawing = torch.optim.Adam(generator.parameters(), config.lr, config.betas)
     every, began = max(1, config.steps // RECORDS), time.perf_counter()
@@ -111,7 +133,7 @@ def _train(
     progress.start("fit cgan", config.steps)
     for step, chosen in enumerate(picture_order(len(targets), batch, config.steps, config.seed), start=1):
         rate = config.lr * min(1.0, 2 * (1 - (step - 1) / config.steps))
-        condition, truth = code.picture(train.pose[chosen], train.grid).to(targets.device), targets[chosen]
+        condition, truth = code.picture(train.pose[chosen], train.grid).to(device), targets[chosen]
         drawn = generator(condition)
         l1 = l1_loss(drawn, truth)
         loss, verdict = config.l1 * l1, None
@@ -128,9 +150,10 @@ def _train(
             mean, losses = torch.stack(losses).mean(0).tolist(), []
             if not mean[0] < float("inf"):
                 raise TrainingError(f"the GAN's loss is {mean[0]} at step {step}; lower lr, which is {config.lr}")
-            progress.update(step, f"L1 {mean[1]:.4f}")
             seconds, judged = time.perf_counter() - began, None if verdict is None else mean[2]
-            curve.append(Step(step, seconds, mean[0], judged, mean[1]))
+            score = None if on_step is None else on_step(step, replace(cgan, history=tuple(curve)))
+            curve.append(Step(step, seconds, mean[0], score, judged, mean[1]))
+            progress.update(step, f"L1 {mean[1]:.4f}")
     progress.finish()
     return tuple(curve)
 

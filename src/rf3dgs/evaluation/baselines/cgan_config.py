@@ -6,7 +6,8 @@ from typing import Literal
 from rf3dgs.core.errors import InputError
 
 PUBLISHED_PASSES = 200
-PICTURES_AT_ONCE = 8
+BATCH = 8
+LEAST_BATCH = 4
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,8 @@ class CganConfig:
     betas: tuple[float, float] = (0.5, 0.999)
     """Adam's decay rates."""
     pixels: int = 480_000
-    """Pixels in one step, at least one picture: eight of 300x200. With one picture alone in a step, batch
-    normalisation takes its level away."""
+    """Pixels in one step: eight pictures of 300x200, but never fewer than four pictures where there are as many;
+    with one alone, batch normalisation takes its level away."""
     steps: int = 64_000
     """Steps of training: one of the discriminator and one of the generator each."""
     seed: int = 0
@@ -72,7 +73,7 @@ class CganConfig:
         if scale not in ("smoke", "laptop", "paper"):
             raise InputError(f'scale must be "smoke", "laptop" or "paper"; got {scale!r}')
         if scale == "paper":
-            return cls(steps=max(1, PUBLISHED_PASSES * pictures // PICTURES_AT_ONCE), seed=seed)
+            return cls(steps=max(1, PUBLISHED_PASSES * pictures // BATCH), seed=seed)
         laptop = cls(
             width=16,
             depth=5,
