@@ -125,8 +125,7 @@ def panels(truth: Truth, rows: Sequence[tuple[str, np.ndarray, Mapping[str, floa
             axis.set_axis_off()
         for axis, (name, power, values) in zip(axes, rows, strict=False):
             axis.imshow(coloured(window.encode(torch.from_numpy(np.array(power))).numpy()), interpolation="nearest")
-            axis.set_title(f"{name}
-{caption(values, shown)}")
+            axis.set_title(f"{name}\n{caption(values, shown)}")
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png")
     return buffer.getvalue()

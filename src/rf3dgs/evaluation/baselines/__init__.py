@@ -1,10 +1,13 @@
-"""What a field must beat: predictors that copy the training spectra, know one path, or follow the published recipe."""
+"""What a field must beat: copies of the training spectra, one known path, the published recipe, and other networks."""
 
 from typing import TYPE_CHECKING
 
 from rf3dgs.core.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from rf3dgs.evaluation.baselines.cgan import Cgan as Cgan
+    from rf3dgs.evaluation.baselines.cgan import fit_cgan as fit_cgan
+    from rf3dgs.evaluation.baselines.cgan_config import CganConfig as CganConfig
     from rf3dgs.evaluation.baselines.constant import Constant as Constant
     from rf3dgs.evaluation.baselines.interpolation import LinearInterpolation as LinearInterpolation
     from rf3dgs.evaluation.baselines.line_of_sight import LineOfSight as LineOfSight
@@ -23,6 +26,9 @@ _HOMES = {
     "fit_published": ".published",
     "PublishedConfig": ".published",
     "PublishedField": ".published",
+    "fit_cgan": ".cgan",
+    "Cgan": ".cgan",
+    "CganConfig": ".cgan_config",
 }
 __all__ = [  # noqa: RUF022 (reading order)
     "NearestNeighbour",
@@ -33,5 +39,8 @@ __all__ = [  # noqa: RUF022 (reading order)
     "fit_published",
     "PublishedConfig",
     "PublishedField",
+    "fit_cgan",
+    "Cgan",
+    "CganConfig",
 ]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)
