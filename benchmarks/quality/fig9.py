@@ -8,6 +8,7 @@ does the score prefer the one whose beam loses less? docs/how-to/figures-9.md ha
 """
 
 import io
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -191,10 +192,12 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def plain(value):
-    """Arrays as lists, for JSON."""
+    """Arrays as lists and NaN as null, for JSON."""
     if isinstance(value, Mapping):
         return {key: plain(one) for key, one in value.items()}
-    return value.tolist() if isinstance(value, np.ndarray) else value
+    if isinstance(value, np.ndarray):
+        return [plain(one) for one in value.tolist()]
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def draw(study: Study, truth: Truth, methods, found, fitted, count: int, wish) -> None:
