@@ -100,6 +100,10 @@ def test_the_indoor_office_has_its_path_loss_and_the_true_line_of_sight(room):
     # Other clusters within the lobe of 12 degrees are later, weaker by 7 dB together, of 20 ns of spread.
     assert float(answer.delay.flatten()[peak]) == pytest.approx(float(away.norm()) / SPEED_OF_LIGHT, abs=5e-9)
     assert float(angle_between(answer.aod.reshape(-1, 3)[peak], -away)) < math.radians(10)
+    dark = answer.power == 0
+    assert bool(dark.any())
+    torch.testing.assert_close(answer.delay[dark], (away.norm() / SPEED_OF_LIGHT).expand(int(dark.sum())))
+    assert float(angle_between(answer.aod[dark], -away.expand(int(dark.sum()), 3)).max()) < 1e-5
 
 
 def test_the_indoor_office_is_in_sight_nearby_and_out_of_sight_far_away(room):
