@@ -197,10 +197,10 @@ def test_offsets_have_the_asked_deviation(hall):
     assert float(offset.mean().abs()) < 5 * 0.1 / math.sqrt(1200)
 
 
-def test_mistaken_materials_are_those_of_another_object_and_shapes_stay(hall):
-    wrong = mistaken(hall)
-    assert [item.material for item in wrong.objects] == ["metal", "concrete", "wood", "concrete"]
-    assert [item.scattering for item in wrong.objects] == [0.2, 0.6, 0.4, 0.6]
+def test_mistaken_materials_are_those_of_the_next_less_reflecting_object_and_shapes_stay(hall):
+    wrong = mistaken(hall)  # metal for concrete, concrete for wood, and wood, which reflects least, for concrete
+    assert [item.material for item in wrong.objects] == ["wood", "concrete", "concrete", "concrete"]
+    assert [item.scattering for item in wrong.objects] == [0.4, 0.6, 0.6, 0.6]
     for before, after in zip(hall.objects, wrong.objects, strict=True):
         assert torch.equal(before.vertices, after.vertices)
         assert (before.name, before.solid) == (after.name, after.solid)
