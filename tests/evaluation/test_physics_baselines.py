@@ -100,6 +100,10 @@ def test_the_indoor_office_has_its_path_loss_and_the_true_line_of_sight(room):
     # Other clusters within the lobe of 12 degrees are later, weaker by 7 dB together, of 20 ns of spread.
     assert float(answer.delay.flatten()[peak]) == pytest.approx(float(away.norm()) / SPEED_OF_LIGHT, abs=5e-9)
     assert float(angle_between(answer.aod.reshape(-1, 3)[peak], -away)) < math.radians(10)
+    dark = answer.power == 0
+    assert bool(dark.any())
+    torch.testing.assert_close(answer.delay[dark], (away.norm() / SPEED_OF_LIGHT).expand(int(dark.sum())))
+    assert float(angle_between(answer.aod[dark], -away.expand(int(dark.sum()), 3)).max()) < 1e-5
 
 
 def test_the_indoor_office_is_in_sight_nearby_and_out_of_sight_far_away(room):
@@ -193,10 +197,10 @@ def test_offsets_have_the_asked_deviation(hall):
     assert float(offset.mean().abs()) < 5 * 0.1 / math.sqrt(1200)
 
 
-def test_mistaken_materials_are_those_of_another_object_and_shapes_stay(hall):
-    wrong = mistaken(hall)
-    assert [item.material for item in wrong.objects] == ["metal", "concrete", "wood", "concrete"]
-    assert [item.scattering for item in wrong.objects] == [0.2, 0.6, 0.4, 0.6]
+def test_mistaken_materials_are_those_of_the_next_less_reflecting_object_and_shapes_stay(hall):
+    wrong = mistaken(hall)  # metal for concrete, concrete for wood, and wood, which reflects least, for concrete
+    assert [item.material for item in wrong.objects] == ["wood", "concrete", "concrete", "concrete"]
+    assert [item.scattering for item in wrong.objects] == [0.4, 0.6, 0.6, 0.6]
     for before, after in zip(hall.objects, wrong.objects, strict=True):
         assert torch.equal(before.vertices, after.vertices)
         assert (before.name, before.solid) == (after.name, after.solid)

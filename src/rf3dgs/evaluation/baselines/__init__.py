@@ -1,4 +1,4 @@
-"""What a field must beat: copies of the training spectra, one known path, the published recipe, and other networks."""
+"""What a field must beat: copies of the training spectra, formulas, the ray tracer, and other learned models."""
 
 from typing import TYPE_CHECKING
 
@@ -13,9 +13,14 @@ if TYPE_CHECKING:
     from rf3dgs.evaluation.baselines.line_of_sight import LineOfSight as LineOfSight
     from rf3dgs.evaluation.baselines.lookup import InverseDistance as InverseDistance
     from rf3dgs.evaluation.baselines.lookup import NearestNeighbour as NearestNeighbour
+    from rf3dgs.evaluation.baselines.path_loss import PathLossPredictor as PathLossPredictor
     from rf3dgs.evaluation.baselines.published import PublishedConfig as PublishedConfig
     from rf3dgs.evaluation.baselines.published import PublishedField as PublishedField
     from rf3dgs.evaluation.baselines.published import fit_published as fit_published
+    from rf3dgs.evaluation.baselines.tr38901 import IndoorOffice as IndoorOffice
+    from rf3dgs.evaluation.baselines.twin import Twin as Twin
+    from rf3dgs.evaluation.baselines.twin import misplaced as misplaced
+    from rf3dgs.evaluation.baselines.twin import mistaken as mistaken
 
 _HOMES = {
     "NearestNeighbour": ".lookup",
@@ -29,6 +34,11 @@ _HOMES = {
     "fit_cgan": ".cgan",
     "Cgan": ".cgan",
     "CganConfig": ".cgan_config",
+    "PathLossPredictor": ".path_loss",
+    "IndoorOffice": ".tr38901",
+    "Twin": ".twin",
+    "misplaced": ".twin",
+    "mistaken": ".twin",
 }
 __all__ = [  # noqa: RUF022 (reading order)
     "NearestNeighbour",
@@ -42,5 +52,10 @@ __all__ = [  # noqa: RUF022 (reading order)
     "fit_cgan",
     "Cgan",
     "CganConfig",
+    "PathLossPredictor",
+    "IndoorOffice",
+    "Twin",
+    "misplaced",
+    "mistaken",
 ]
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

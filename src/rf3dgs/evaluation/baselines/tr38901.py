@@ -1,6 +1,7 @@
 """3GPP TR 38.901, indoor office, as a predictor: what standards expect of a room that nobody has seen."""
 
 import math
+from dataclasses import replace
 
 import torch
 
@@ -8,7 +9,7 @@ from rf3dgs.channel.cdl import cdl_paths, indoor_office_spreads, scaled_rays
 from rf3dgs.channel.path_loss import open_office_sight, tr38901_indoor_loss
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid
-from rf3dgs.core.units import power_from_db
+from rf3dgs.core.units import SPEED_OF_LIGHT, power_from_db
 from rf3dgs.evaluation.baselines.path_loss import transmitter_of
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Spectrum
@@ -43,9 +44,15 @@ class IndoorOffice:
         return float(open_office_sight(torch.tensor(flat))) >= 0.5
 
     def render(self, pose: Pose, grid: DirectionGrid) -> Spectrum:
-        """The spectrum `[row, col]` at one pose, with delay and departure."""
+        """The spectrum `[row, col]` at one pose; delay and departure are the straight way's where nothing arrives."""
         sight = self.sees(pose)
         distance = torch.linalg.vector_norm(pose.position - self.tx.position)
         gain = power_from_db(-tr38901_indoor_loss(distance, self.frequency, line_of_sight=sight))
         paths = cdl_paths(self.rays[sight], self.tx, pose, self.frequency, gain, seed=self.seed)
-        return spectrum_of(paths, None, grid, lobe=self.lobe)
+        seen = spectrum_of(paths, None, grid, lobe=self.lobe)
+        assert seen.delay is not None
+        assert seen.aod is not None
+        dark, straight = seen.power == 0, (pose.position - self.tx.position) / distance
+        delay = torch.where(dark, distance / SPEED_OF_LIGHT, seen.delay)
+        aod = torch.where(dark[..., None], straight, seen.aod)
+        return replace(seen, method=self.name, delay=delay, aod=aod)

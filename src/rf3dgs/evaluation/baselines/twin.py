@@ -1,5 +1,6 @@
 """Digital twins as predictors: the ray tracer itself, on the true scene or on one that is a little wrong."""
 
+import math
 from dataclasses import replace
 
 import torch
@@ -12,7 +13,8 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid
 from rf3dgs.propagation.config import TraceConfig
 from rf3dgs.propagation.sionna import Tracer
-from rf3dgs.propagation.sites.scene import Scene, without_looks
+from rf3dgs.propagation.sites.materials import VACUUM_PERMITTIVITY
+from rf3dgs.propagation.sites.scene import Scene, SceneObject, without_looks
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Spectrum
 
@@ -66,16 +68,17 @@ def misplaced(scene: Scene, deviation: float, *, seed: int = 0) -> Scene:
 
 
 def mistaken(scene: Scene) -> Scene:
-    """The scene with each material taken for the next one in the alphabet of those in it, the last for the first.
+    """The scene with each material taken for the one in it that reflects next less, the least for the one above it.
 
-    An object gets permittivity, thickness, scattering amplitude and lobe of the first object of that material. Shapes
-    stay. InputError for a scene that is traced from a file, or whose objects are all of one material.
+    They are ordered by the size of the complex permittivity at the scene's frequency. An object gets permittivity,
+    thickness, scattering amplitude and lobe of the first object of that material. Shapes stay. InputError for a scene
+    that is traced from a file, or whose objects are all of one material.
     """
     first = {item.material: item for item in reversed(_own(scene))}
-    names = sorted(first)
-    if len(names) < 2:
-        raise InputError(f"materials are mistaken for others in the scene; {scene.name!r} has only {', '.join(names)}")
-    other = {name: first[names[(place + 1) % len(names)]] for place, name in enumerate(names)}
+    ranked = sorted(first.values(), key=lambda item: (_reflects(item, scene.frequency), item.material))
+    if len(ranked) < 2:
+        raise InputError(f"materials are mistaken for others in the scene; {scene.name!r} has only {', '.join(first)}")
+    other = {item.material: ranked[abs(place - 1)] for place, item in enumerate(ranked)}
     objects = (
         replace(
             item,
@@ -90,7 +93,13 @@ def mistaken(scene: Scene) -> Scene:
     return replace(scene, objects=tuple(objects))
 
 
-def _own(scene: Scene) -> tuple:
+def _reflects(item: SceneObject, frequency: float) -> float:
+    """Size of the complex relative permittivity."""
+    real, conductivity = item.permittivity(frequency)
+    return math.hypot(real, conductivity / (2 * math.pi * frequency * VACUUM_PERMITTIVITY))
+
+
+def _own(scene: Scene) -> tuple[SceneObject, ...]:
     if scene.source is not None:
         raise InputError(
             f"the scene {scene.name!r} is traced from {scene.source.name}, whose objects cannot be changed here; use a "
