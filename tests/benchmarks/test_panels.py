@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from benchmarks.quality import fig1, fig6, panel_data
+from benchmarks.quality import fig1, fig6, fig6_scores, panel_data
 from benchmarks.quality.methods.method import Method
 from benchmarks.quality.panel_data import kept, positions_of
 
@@ -151,7 +151,7 @@ def scored(truth, answer, *, noise: float = 0.0):
     """Scores against two solves of `truth` with that much independent noise [dB]."""
     generator = torch.Generator().manual_seed(9)
     solves = [truth * 10 ** (noise / 10 * torch.randn(truth.shape, generator=generator)) for _ in range(2)]
-    return fig6.scores((solves[0], solves[1]), answer, GRID, WINDOW, math.radians(7.5))
+    return fig6_scores.scores((solves[0], solves[1]), answer, GRID, WINDOW, math.radians(7.5))
 
 
 def test_the_truth_is_perfect_against_itself():
@@ -162,7 +162,7 @@ def test_the_truth_is_perfect_against_itself():
         # SSIM is float32, the others double: rounding is below 1e-6.
         assert found[name] == pytest.approx(np.full(3, value), abs=1e-6), name
     for name in ("detail_match", "sharpness"):
-        assert fig6.statistic(name, found[name]) == pytest.approx(1.0, abs=1e-6), name
+        assert fig6_scores.statistic(name, found[name]) == pytest.approx(1.0, abs=1e-6), name
 
 
 def test_noise_of_the_truth_is_taken_off():
@@ -175,14 +175,14 @@ def test_noise_of_the_truth_is_taken_off():
     same = scored(truth, truth, noise=3.0)
     assert same["rmse_db"].mean() < 0.7  # 3 / sqrt(2) = 2.1 dB if it were not
     for name in ("detail_match", "sharpness"):
-        assert fig6.statistic(name, same[name]) == pytest.approx(1.0, abs=0.05), name
+        assert fig6_scores.statistic(name, same[name]) == pytest.approx(1.0, abs=0.05), name
 
 
 def test_another_truth_has_no_detail_in_common():
     found = scored(random_power(0), random_power(1))
     # Independent pictures of 3 x 864 pixels: the correlation scatters by 1 / sqrt(2592) = 0.02; four of that.
-    assert abs(fig6.statistic("detail_match", found["detail_match"])) < 0.08
-    assert fig6.statistic("sharpness", found["sharpness"]) == pytest.approx(
+    assert abs(fig6_scores.statistic("detail_match", found["detail_match"])) < 0.08
+    assert fig6_scores.statistic("sharpness", found["sharpness"]) == pytest.approx(
         1.0, abs=0.1
     )  # alike in kind: the mean of 800 slopes each
 
@@ -192,13 +192,13 @@ def test_a_gain_of_all_levels_is_coarse_and_leaves_the_detail():
     found = scored(truth, 2 * truth)
     assert found["coarse_db"] == pytest.approx(np.full(3, 10 * math.log10(2)), rel=1e-5)
     assert found["detail_db"] == pytest.approx(np.zeros(3), abs=1e-4)  # float32 levels of some 40 dB
-    assert fig6.statistic("detail_match", found["detail_match"]) == pytest.approx(1.0, abs=1e-6)
+    assert fig6_scores.statistic("detail_match", found["detail_match"]) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_blurring_takes_sharpness_away():
     truth = random_power(0)
-    smooth, _ = fig6.detail_of(10 * torch.log10(truth), 2.0)
-    assert fig6.statistic("sharpness", scored(truth, (10 ** (smooth / 10)).float())["sharpness"]) < 0.5
+    smooth, _ = fig6_scores.detail_of(10 * torch.log10(truth), 2.0)
+    assert fig6_scores.statistic("sharpness", scored(truth, (10 ** (smooth / 10)).float())["sharpness"]) < 0.5
 
 
 def test_the_narrower_lobe_has_the_larger_peak(given):
@@ -230,12 +230,12 @@ def test_points_drawn_finer_keep_their_power(given, tmp_path):
 
 def test_an_interval_holds_the_mean_and_a_verdict_needs_a_clear_difference():
     values = np.random.default_rng(0).normal(size=40)
-    mean, low, high = fig6.interval("rmse_db", values)
+    mean, low, high = fig6_scores.interval("rmse_db", values)
     assert low < mean < high
-    assert fig6.verdict("rmse_db", values, values + 1.0) == "nearer"
-    assert fig6.verdict("psnr_db", values, values + 1.0) == "farther"
-    assert fig6.verdict("rmse_db", values, np.roll(values, 1)) == "same"
-    assert fig6.verdict("sharpness", np.full((9, 2), (0.8, 1.0)), np.full((9, 2), (2.0, 1.0))) == "nearer"
+    assert fig6_scores.verdict("rmse_db", values, values + 1.0) == "nearer"
+    assert fig6_scores.verdict("psnr_db", values, values + 1.0) == "farther"
+    assert fig6_scores.verdict("rmse_db", values, np.roll(values, 1)) == "same"
+    assert fig6_scores.verdict("sharpness", np.full((9, 2), (0.8, 1.0)), np.full((9, 2), (2.0, 1.0))) == "nearer"
 
 
 def test_what_was_made_from_something_else_is_made_again(tmp_path):
