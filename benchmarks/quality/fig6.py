@@ -23,7 +23,7 @@ from torch import Tensor
 
 from benchmarks.quality.fig1 import COLUMNS, OURS
 from benchmarks.quality.fig6_scores import COLUMNS as SCORES
-from benchmarks.quality.fig6_scores import blur_of, detail_of, interval, noise_of, scores, verdict
+from benchmarks.quality.fig6_scores import blur_of, detail_of, interval, scores, truth_of, verdict
 from benchmarks.quality.methods.method import Task
 from benchmarks.quality.panel_data import (
     FOV_DEG,
@@ -232,7 +232,7 @@ def main(words: Sequence[str] | None = None) -> int:
     window = window_for(replace(coarse, power=truth))
     found = {name: scores(solves, power, grid, window, lobe) for name, power in answers.items()}
     against = {
-        name: {score: verdict(score, values[score], found[COARSE][score]) for score in SCORES}
+        name: {score: verdict(score, values[score], found[COARSE][score]) for score in SCORES if score != "sharpness"}
         for name, values in found.items()
         if name != COARSE
     }
@@ -248,14 +248,18 @@ def main(words: Sequence[str] | None = None) -> int:
         "judged": judged,
         "lobe_deg": {"training": math.degrees(lobe), "truth": how.lobe_deg},
         "window": [window.floor_db, window.ceil_db],
+        "finer truth": truth_of(solves, grid, window, lobe),
         "scores": {
             name: {score: values.tolist() for score, values in column.items()} for name, column in found.items()
         },
         "against training quality": against,
     }
     write_whole(out / "fig6.json", (json.dumps(facts, indent=1) + "\n").encode())
-    true, noise = noise_of(solves, grid, window, lobe)
-    said = f"The finer truth has {true:.2f} dB of detail (RMS) and {noise:.2f} dB of noise, taken off but from SSIM."
+    true = truth_of(solves, grid, window, lobe)
+    said = (
+        f"The finer truth has {true['detail']:.2f} dB of detail (RMS), a sharpness of {true['sharpness']:.2f} dB/pixel "
+        f"and {true['noise']:.2f} dB of noise, which is taken off, but not from SSIM."
+    )
     text = f"{_table(found, against)}\n\n{said}"
     write_whole(out / "fig6.md", (text + "\n").encode())
     print(text)
@@ -270,7 +274,7 @@ def _table(found: Mapping[str, Mapping[str, np.ndarray]], against: Mapping[str, 
         row = [name]
         for score, (_, digits) in SCORES.items():
             mean, low, high = interval(score, values[score])
-            said = f" ({against[name][score]})" if name in against else ""
+            said = f" ({against[name][score]})" if score in against.get(name, {}) else ""
             row.append(f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]{said}")
         rows.append(row)
     return table_text(("against the finer truth", *(label for label, _ in SCORES.values())), rows)

@@ -18,9 +18,9 @@ COLUMNS = {
     "coarse_db": ("coarse RMSE [dB]", 2),
     "detail_db": ("detail RMSE [dB]", 2),
     "detail_match": ("detail match", 3),
-    "sharpness": ("sharpness", 2),
+    "sharpness": ("sharpness [dB/pixel]", 2),
 }
-HIGHER = ("psnr_db", "ssim", "detail_match", "sharpness")  # the last one is best at 1
+HIGHER = ("psnr_db", "ssim", "detail_match")  # better when higher
 
 
 def detail_of(level: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
@@ -48,8 +48,8 @@ def scores(
     The truth is the mean level of the solves. Half their difference has as much noise as that mean: its square is taken
     off every square, which makes them unbiased for an answer that shares no ray with the solves. "coarse" is what a
     Gaussian as wide as the training `lobe` [rad] leaves of the levels, "detail" what it removes. SSIM alone
-    compares with the truth as it is, noise and all. "detail_match" `[n, 3]` and "sharpness" `[n, 2]` are squares that
-    `statistic` divides when it has summed them over the positions.
+    compares with the truth as it is, noise and all. "detail_match" `[n, 3]` are squares that `statistic`
+    divides when it has summed them over the positions; "sharpness" [dB/pixel] is the answer's own RMS gradient.
     """
     sigma = blur_of(grid, lobe)
     first, second, level = (metrics.window_level(power, window).double() for power in (*solves, answer))
@@ -68,17 +68,22 @@ def scores(
         "detail_match": torch.stack(
             ((own * detail).mean((-2, -1)), _power(own), _power(detail) - _power(noise_detail)), -1
         ),
-        "sharpness": torch.stack((_slope(level), _slope(truth) - _slope(noise)), -1),
+        "sharpness": _slope(level).sqrt(),
     }
     return {name: value.double().numpy() for name, value in found.items()}
 
 
-def noise_of(solves: tuple[Tensor, Tensor], grid: DirectionGrid, window: DbWindow, lobe: float) -> tuple[float, float]:
-    """The RMS [dB] of the detail that the truth of two solves has, and that of its noise of any scale."""
-    detail = scores(solves, solves[1], grid, window, lobe)["detail_match"][:, 2]
+def truth_of(solves: tuple[Tensor, Tensor], grid: DirectionGrid, window: DbWindow, lobe: float) -> dict[str, float]:
+    """What the truth of two solves has: RMS of its "detail" and of its "noise" [dB], "sharpness" [dB/pixel].
+
+    Detail and sharpness are without the noise, 0 where they drown in it.
+    """
     first, second = (metrics.window_level(power, window).double() for power in solves)
-    noise = _power(0.5 * (first - second)).mean()
-    return math.sqrt(max(0.0, float(detail.mean()))), math.sqrt(float(noise))
+    truth, noise = 0.5 * (first + second), 0.5 * (first - second)
+    detail = scores(solves, solves[1], grid, window, lobe)["detail_match"][:, 2].mean()
+    slope = float((_slope(truth) - _slope(noise)).mean())
+    squares = {"detail": float(detail), "noise": float(_power(noise).mean()), "sharpness": slope}
+    return {name: math.sqrt(max(0.0, value)) for name, value in squares.items()}
 
 
 def _power(level: Tensor) -> Tensor:
@@ -99,16 +104,12 @@ def _slope(level: Tensor) -> Tensor:
 def statistic(name: str, values: np.ndarray) -> np.ndarray:
     """What a table shows `[*batch]` of a score's values `[*batch, n]`: their mean.
 
-    Of "detail_match" `[*batch, n, 3]`, covariance and both variances, the correlation over all positions; of
-    "sharpness" `[*batch, n, 2]`, squared gradients, the RMS gradient over that of the truth.
+    Of "detail_match" `[*batch, n, 3]`, covariance and both variances, the correlation over all positions.
     """
-    if name == "detail_match":
-        common, own, true = np.moveaxis(values.mean(-2), -1, 0)
-        return common / np.sqrt(np.maximum(own * true, 1e-24))
-    if name == "sharpness":
-        own, true = np.moveaxis(values.mean(-2), -1, 0)
-        return np.sqrt(own / np.maximum(true, 1e-12))
-    return values.mean(-1)
+    if name != "detail_match":
+        return values.mean(-1)
+    common, own, true = np.moveaxis(values.mean(-2), -1, 0)
+    return common / np.sqrt(np.maximum(own * true, 1e-24))
 
 
 def drawn(count: int, seed: int = 0) -> np.ndarray:
@@ -129,8 +130,6 @@ def verdict(name: str, ours: np.ndarray, theirs: np.ndarray) -> str:
     """
     places = drawn(len(ours))
     mine, other = (statistic(name, values[places]) for values in (ours, theirs))
-    if name == "sharpness":
-        mine, other = -np.abs(mine - 1.0), -np.abs(other - 1.0)
     gain = mine - other if name in HIGHER else other - mine
     low, high = np.percentile(gain, (2.5, 97.5))
     return "nearer" if low > 0 else "farther" if high < 0 else "same"
