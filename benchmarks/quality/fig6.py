@@ -22,6 +22,8 @@ import torch
 from torch import Tensor
 
 from benchmarks.quality.fig1 import COLUMNS, OURS
+from benchmarks.quality.fig6_scores import COLUMNS as SCORES
+from benchmarks.quality.fig6_scores import blur_of, detail_of, interval, scores, truth_of, verdict
 from benchmarks.quality.methods.method import Task
 from benchmarks.quality.panel_data import (
     FOV_DEG,
@@ -85,18 +87,7 @@ SCALES = {
 FINER = 3  # times the rays
 AGAIN = 7919  # more rays for the second solve of the finer truth: another lattice
 SEED = 200_003  # of the finer truth, away from those of the paths
-RESAMPLES = 2000
 COARSE, SHARP = "training quality at that pose", "our field, points in the fine lobe"
-COLUMNS_OF_SCORES = {
-    "psnr_db": ("PSNR [dB]", 2),
-    "ssim": ("SSIM", 3),
-    "rmse_db": ("RMSE [dB]", 2),
-    "coarse_db": ("coarse RMSE [dB]", 2),
-    "detail_db": ("detail RMSE [dB]", 2),
-    "detail_match": ("detail match", 3),
-    "sharpness": ("sharpness", 2),
-}
-HIGHER = ("psnr_db", "ssim", "detail_match", "sharpness")  # the last one is best at 1
 
 
 @dataclass(frozen=True)
@@ -116,106 +107,6 @@ class Sharper:
         whole = replace(self.field, instrument=fine).render(pose, grid, csi=False)
         points = (whole.power - surface).clamp_min(0.0)
         return replace(whole, power=surface + points * (self.field.instrument.beam_solid_angle / fine.beam_solid_angle))
-
-
-def detail_of(level: Tensor, sigma: float) -> tuple[Tensor, Tensor]:
-    """Levels `[n, row, col]` [dB] smoothed by a Gaussian of `sigma` [pixel], edges repeated, and what that removes."""
-    reach = max(1, math.ceil(3.0 * sigma))
-    kernel = torch.exp(-0.5 * (torch.arange(-reach, reach + 1, dtype=torch.float64) / sigma) ** 2)
-    kernel = kernel / kernel.sum()
-    picture = torch.nn.functional.pad(level.double()[:, None], (reach,) * 4, mode="replicate")
-    picture = torch.nn.functional.conv2d(picture, kernel[None, None, :, None])
-    smooth = torch.nn.functional.conv2d(picture, kernel[None, None, None, :])[:, 0]
-    return smooth, level.double() - smooth
-
-
-def scores(
-    solves: tuple[Tensor, Tensor], answer: Tensor, grid: DirectionGrid, window: DbWindow, lobe: float
-) -> dict[str, np.ndarray]:
-    """Scores `[n]` of powers `[n, row, col]`, linear, against two `solves` of the truth; levels clipped to the window.
-
-    The truth is the mean level of the solves. Half their difference has as much noise as that mean: its square is taken
-    off every square, which makes them unbiased for an answer that shares no ray with the solves. "coarse" is what a
-    Gaussian as wide as the training `lobe` [rad] leaves of the levels, "detail" what it removes. SSIM alone
-    compares with the truth as it is, noise and all. "detail_match" `[n, 3]` and "sharpness" `[n, 2]` are squares that
-    `statistic` divides when it has summed them over the positions.
-    """
-    assert grid.K is not None
-    sigma = float(grid.K[0, 0]) * lobe / math.sqrt(8.0 * math.log(2.0))
-    first, second, level = (metrics.window_level(power, window).double() for power in (*solves, answer))
-    truth, noise = 0.5 * (first + second), 0.5 * (first - second)
-    (_, detail), (gap, gap_detail), (noise_smooth, noise_detail) = (
-        detail_of(part, sigma) for part in (truth, level - truth, noise)
-    )
-    own = detail + gap_detail
-    rmse = _root(_power(level - truth) - _power(noise))
-    found = {
-        "psnr_db": (20.0 * torch.log10(window.span_db / rmse.clamp_min(1e-30))).clamp_max(metrics.PERFECT_PSNR_DB),
-        "ssim": metrics.ssim(*((part - window.floor_db) / window.span_db for part in (truth, level)), grid),
-        "rmse_db": rmse,
-        "coarse_db": _root(_power(gap) - _power(noise_smooth)),
-        "detail_db": _root(_power(gap_detail) - _power(noise_detail)),
-        "detail_match": torch.stack(
-            ((own * detail).mean((-2, -1)), _power(own), _power(detail) - _power(noise_detail)), -1
-        ),
-        "sharpness": torch.stack((_slope(level), _slope(truth) - _slope(noise)), -1),
-    }
-    return {name: value.double().numpy() for name, value in found.items()}
-
-
-def _power(level: Tensor) -> Tensor:
-    """Mean square `[n]` of `[n, row, col]`."""
-    return level.square().mean((-2, -1))
-
-
-def _root(square: Tensor) -> Tensor:
-    return square.clamp_min(0.0).sqrt()
-
-
-def _slope(level: Tensor) -> Tensor:
-    """Mean squared gradient `[n]` of levels `[n, row, col]` [dB per pixel]."""
-    across, down = level[:, :-1, 1:] - level[:, :-1, :-1], level[:, 1:, :-1] - level[:, :-1, :-1]
-    return (across.square() + down.square()).mean((-2, -1))
-
-
-def statistic(name: str, values: np.ndarray) -> np.ndarray:
-    """What a table shows `[*batch]` of a score's values `[*batch, n]`: their mean.
-
-    Of "detail_match" `[*batch, n, 3]`, covariance and both variances, the correlation over all positions; of
-    "sharpness" `[*batch, n, 2]`, squared gradients, the RMS gradient over that of the truth.
-    """
-    if name == "detail_match":
-        common, own, true = np.moveaxis(values.mean(-2), -1, 0)
-        return common / np.sqrt(np.maximum(own * true, 1e-24))
-    if name == "sharpness":
-        own, true = np.moveaxis(values.mean(-2), -1, 0)
-        return np.sqrt(own / np.maximum(true, 1e-12))
-    return values.mean(-1)
-
-
-def drawn(count: int, seed: int = 0) -> np.ndarray:
-    """Positions `[RESAMPLES, count]` of the bootstrap."""
-    return np.random.default_rng(seed).integers(count, size=(RESAMPLES, count))
-
-
-def interval(name: str, values: np.ndarray) -> tuple[float, float, float]:
-    """The statistic of a score over the positions, and its 95 % bootstrap interval."""
-    low, high = np.percentile(statistic(name, values[drawn(len(values))]), (2.5, 97.5))
-    return float(statistic(name, values)), float(low), float(high)
-
-
-def verdict(name: str, ours: np.ndarray, theirs: np.ndarray) -> str:
-    """Whether the first is "nearer" to the finer truth than the second by a score, "farther", or "same".
-
-    Positions are resampled in pairs; the 95 % interval of the difference must leave out zero.
-    """
-    places = drawn(len(ours))
-    mine, other = (statistic(name, values[places]) for values in (ours, theirs))
-    if name == "sharpness":
-        mine, other = -np.abs(mine - 1.0), -np.abs(other - 1.0)
-    gain = mine - other if name in HIGHER else other - mine
-    low, high = np.percentile(gain, (2.5, 97.5))
-    return "nearer" if low > 0 else "farther" if high < 0 else "same"
 
 
 def finer_paths(given: Path | None, reader: PathsReader, number: int, again: bool, size: Size) -> Paths:
@@ -247,16 +138,19 @@ def training_pictures(how: Fineness) -> tuple[Callable[[Paths, int], Spectrum], 
     return lambda paths, seed: spectrum_of(paths, None, grid, lobe=lobe), lobe
 
 
-def draw(truth: Tensor, answers: Mapping[str, Tensor], window: DbWindow) -> bytes:
-    """One view `[row, col]` of each as PNG bytes; below, the ninth of it in which the finer truth has most edges."""
+def draw(solves: tuple[Tensor, Tensor], answers: Mapping[str, Tensor], window: DbWindow, sigma: float) -> bytes:
+    """One view `[row, col]` of each as PNG bytes; below, the ninth of it in which both solves have most detail alike.
+
+    sigma [pixel]: what is finer than such a Gaussian counts as detail.
+    """
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
+    truth = (solves[0] + solves[1]) / 2
     height, width = truth.shape
-    level = metrics.window_level(truth, window)[None]
-    steep = torch.nn.functional.pad((level[:, 1:, 1:] - level[:, :-1, :-1]).abs(), (0, 1, 0, 1))
-    place = torch.nn.functional.avg_pool2d(steep[:, None], (height // 3, width // 3), 1)[0, 0]
-    row, col = divmod(int(place.argmax()), place.shape[1])
+    (_, first), (_, second) = (detail_of(metrics.window_level(power, window)[None], sigma) for power in solves)
+    alike = torch.nn.functional.avg_pool2d(first * second, (height // 3, width // 3), 1)[0]
+    row, col = divmod(int(alike.argmax()), alike.shape[1])
     panels = {"finer truth": truth} | dict(answers)
     with mpl.rc_context({**STYLE, "font.size": 8, "axes.titlesize": 8}):
         figure = Figure(figsize=(2.3 * len(panels), 3.4), dpi=100, layout="constrained")
@@ -338,13 +232,15 @@ def main(words: Sequence[str] | None = None) -> int:
     window = window_for(replace(coarse, power=truth))
     found = {name: scores(solves, power, grid, window, lobe) for name, power in answers.items()}
     against = {
-        name: {score: verdict(score, values[score], found[COARSE][score]) for score in COLUMNS_OF_SCORES}
+        name: {score: verdict(score, values[score], found[COARSE][score]) for score in SCORES if score != "sharpness"}
         for name, values in found.items()
         if name != COARSE
     }
     view = options.view % len(judged)
     shown = {name: power[view] for name, power in answers.items()}
-    write_whole(out / "fig6.png", draw(truth[view], shown, colour_range([replace(coarse[view], power=truth[view])])))
+    colours = colour_range([replace(coarse[view], power=truth[view])])
+    picture = draw((solves[0][view], solves[1][view]), shown, colours, blur_of(grid, lobe))
+    write_whole(out / "fig6.png", picture)
     facts = {
         "scale": options.scale,
         "seed": options.seed,
@@ -352,26 +248,23 @@ def main(words: Sequence[str] | None = None) -> int:
         "judged": judged,
         "lobe_deg": {"training": math.degrees(lobe), "truth": how.lobe_deg},
         "window": [window.floor_db, window.ceil_db],
+        "finer truth": truth_of(solves, grid, window, lobe),
         "scores": {
             name: {score: values.tolist() for score, values in column.items()} for name, column in found.items()
         },
         "against training quality": against,
     }
     write_whole(out / "fig6.json", (json.dumps(facts, indent=1) + "\n").encode())
-    text = _table(found, against) + "\n\n" + _noise_text(solves, grid, window, lobe)
+    true = truth_of(solves, grid, window, lobe)
+    said = (
+        f"The finer truth has {true['detail']:.2f} dB of detail (RMS), a sharpness of {true['sharpness']:.2f} dB/pixel "
+        f"and {true['noise']:.2f} dB of noise, which is taken off, but not from SSIM."
+    )
+    text = f"{_table(found, against)}\n\n{said}"
     write_whole(out / "fig6.md", (text + "\n").encode())
     print(text)
     print(f"{len(training)} training positions, {len(judged)} judged; {time.process_time() - started:.0f} s of CPU")
     return 0
-
-
-def _noise_text(solves: tuple[Tensor, Tensor], grid: DirectionGrid, window: DbWindow, lobe: float) -> str:
-    """How much detail the finer truth has, and how much of what it shows is noise."""
-    found = scores(solves, solves[1], grid, window, lobe)["detail_match"]
-    level = [metrics.window_level(power, window).double() for power in solves]
-    noise = float((0.25 * _power(level[0] - level[1])).mean().sqrt())
-    true = math.sqrt(max(0.0, float(found[:, 2].mean())))
-    return f"The finer truth has {true:.2f} dB of detail (RMS) and {noise:.2f} dB of noise, taken off but from SSIM."
 
 
 def _table(found: Mapping[str, Mapping[str, np.ndarray]], against: Mapping[str, Mapping[str, str]]) -> str:
@@ -379,12 +272,12 @@ def _table(found: Mapping[str, Mapping[str, np.ndarray]], against: Mapping[str, 
     rows = []
     for name, values in found.items():
         row = [name]
-        for score, (_, digits) in COLUMNS_OF_SCORES.items():
+        for score, (_, digits) in SCORES.items():
             mean, low, high = interval(score, values[score])
-            said = f" ({against[name][score]})" if name in against else ""
+            said = f" ({against[name][score]})" if score in against.get(name, {}) else ""
             row.append(f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]{said}")
         rows.append(row)
-    return table_text(("against the finer truth", *(label for label, _ in COLUMNS_OF_SCORES.values())), rows)
+    return table_text(("against the finer truth", *(label for label, _ in SCORES.values())), rows)
 
 
 if __name__ == "__main__":

@@ -229,7 +229,7 @@ def table_text(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def small_png(figure) -> bytes:
-    """A matplotlib figure as PNG bytes in 200 colours."""
+    """A matplotlib figure as PNG bytes, packed as small as they go."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image
 
@@ -237,7 +237,7 @@ def small_png(figure) -> bytes:
     whole, small = io.BytesIO(), io.BytesIO()
     figure.savefig(whole, format="png")
     picture = Image.open(io.BytesIO(whole.getvalue())).convert("RGB")
-    picture.quantize(200, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
+    picture.save(small, "PNG", optimize=True)
     return small.getvalue()
 
 
