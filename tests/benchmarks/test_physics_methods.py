@@ -1,7 +1,9 @@
 """The methods that know physics: every one is made from a task, answers on its grid, and says what decides it."""
 
+import importlib.util
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,6 +14,9 @@ from rf3dgs.channel.path_loss import LogDistance
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid
+from rf3dgs.propagation.llvm import find_llvm
+from rf3dgs.propagation.sites.scene import Scene, SceneObject
+from rf3dgs.propagation.sites.shapes import box
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 
@@ -59,3 +64,24 @@ def test_models_for_cities_refuse_60_ghz_and_name_what_does_not(task, name):
 def test_twins_need_a_scene(task, name):
     with pytest.raises(InputError, match=f"'{name}' needs a task with scene"):
         METHODS[name].made(task)
+
+
+def test_a_twin_whose_walls_moved_still_sees_the_transmitter_and_nearly_the_same_gain(task):
+    if importlib.util.find_spec("sionna") is None:
+        pytest.skip("sionna-rt is not installed")
+    if find_llvm().path is None:
+        pytest.skip(f"no LLVM for the ray tracer: {find_llvm().reason}")
+    shell, crate = box((0.0, 0.0, 0.0), (12.0, 13.0, 3.0)), box((9.0, 1.0, 0.0), (10.0, 2.0, 1.0))
+    things = (
+        SceneObject("shell", shell[0], shell[1].flip(1), "concrete", 0.6),
+        SceneObject("crate", crate[0], crate[1], "wood", 0.4, solid=True),
+    )
+    bounds = ((0.0, 0.0, 0.0), (12.0, 13.0, 3.0))
+    tx = task.spectra.tx
+    room = replace(task, scene=Scene("room", things, tx, bounds, bounds, bounds, 60e9))
+    pose = task.spectra.pose[0]
+    true, moved = (METHODS[name].made(room).render(pose, task.spectra.grid) for name in ("twin", "twin-5cm"))
+    assert not torch.equal(true.power, moved.power)
+    # Most of the gain is the line of sight, which is where it was.
+    assert abs(10 * math.log10(float(moved.path_gain / true.path_gain))) < 1.0
+    assert int(true.power.argmax()) == int(moved.power.argmax())

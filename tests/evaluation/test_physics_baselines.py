@@ -169,6 +169,8 @@ def test_a_twin_with_something_solid_at_the_receiver_still_answers(traced, room)
     clear = traced.render(Pose((3.5, 2.5, 0.5)), room.grid)
     assert bool(torch.isfinite(answer.power).all())
     assert float(answer.path_gain) < 0.01 * float(clear.path_gain)
+    outside = traced.render(Pose((20.0, 3.5, 1.5)), room.grid)
+    assert float(outside.power.abs().max()) == 0.0
 
 
 def test_misplaced_objects_move_as_a_whole_and_the_transmitter_stays(hall):
