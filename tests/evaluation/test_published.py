@@ -1,7 +1,7 @@
 """Laws of the published recipe: what its pictures show, how they are read, and that it learns."""
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import pytest
 import torch
@@ -123,10 +123,24 @@ def test_what_the_recipe_cannot_use_is_refused(walls):
         fit_published(walls, train, PublishedConfig(steps=0), window=WINDOW)
     with pytest.raises(InputError, match="target must be one of jet, db, view-db, view-linear; got 'grey'"):
         fit_published(walls, train, PublishedConfig(target="grey"), window=WINDOW)  # type: ignore[arg-type]
+    for power, message in ((-train.power, "negative, NaN or infinite"), (0 * train.power, "no power anywhere")):
+        with pytest.raises(InputError, match=message):
+            fit_published(walls, replace(train, power=power), window=WINDOW)
+    with pytest.raises(InputError, match=r"needs spectra \[picture, row, col\]; got power \[12, 18\]"):
+        fit_published(walls, train[0], window=WINDOW)
     listed = list_grid(GRID.directions.reshape(-1, 3))
     flat = Spectrum(train.power.reshape(4, *listed.shape), listed, train.pose, 60e9, train.instrument)
     with pytest.raises(InputError, match="needs pinhole or equirectangular spectra; got a list"):
         fit_published(walls, flat, PublishedConfig(steps=1), window=WINDOW)
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_dark_picture_among_others_is_learned_as_dark(walls, target):
+    train = seen(around(2, 0))
+    power = train.power.clone()
+    power[3] = 0.0
+    field = fit_published(walls, replace(train, power=power), PublishedConfig(target=target, steps=10), window=WINDOW)
+    assert bool(torch.isfinite(field.gaussians.sh).all())
 
 
 def test_every_method_of_the_file_answers_and_needs_geometry(walls):

@@ -28,7 +28,6 @@ from rf3dgs.splats.target import Target
 from rf3dgs.splats.trainer import Trainer
 from rf3dgs.training.checkpoint import State
 from rf3dgs.training.loop import train, view_at
-from rf3dgs.training.radio import check_spectra
 
 
 @dataclass(frozen=True)
@@ -121,14 +120,15 @@ def fit_published(
 ) -> PublishedField:
     """Colour frozen `geometry` after `spectra` `[picture, row, col]`, whose levels are painted in `window`.
 
-    Pixels of pinholes count alike, as published, those of spheres by their solid angle. Raises InputError for spectra
-    that are empty, constant or not finite, and TrainingError when training cannot go on.
+    Pixels of pinholes count alike, as published, those of spheres by their solid angle. A picture may be dark. Raises
+    InputError for spectra that have no power at all, or power that is negative or not finite, and TrainingError when
+    training cannot go on.
     """
     config = PublishedConfig() if config is None else config
     if config.steps < 1:
         raise InputError(f"steps must be at least 1; got {config.steps}")
     geometry.check()
-    check_spectra(spectra)
+    _check(spectra.power)
     if spectra.grid.kind == "list":
         raise InputError("the published recipe needs pinhole or equirectangular spectra; got a list of directions")
     scale = Scale.of(config.target, window, spectra.power)
@@ -137,3 +137,12 @@ def fit_published(
     train(stage, config.steps, label=f"published recipe, {config.target}", identity=identity, progress=progress)
     coloured = stage.trainer.gaussians()
     return PublishedField(coloured, scale, spectra.frequency, spectra.instrument, spectra.tx, config.backend)
+
+
+def _check(power: Tensor) -> None:
+    if power.dim() != 3 or not len(power):
+        raise InputError(f"the published recipe needs spectra [picture, row, col]; got power {list(power.shape)}")
+    if not bool(torch.isfinite(power).all()) or bool((power < 0).any()):
+        raise InputError("spectra have power that is negative, NaN or infinite; power must be linear and finite")
+    if not bool((power > 0).any()):
+        raise InputError("spectra have no power anywhere; check their source")
