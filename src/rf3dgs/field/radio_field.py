@@ -21,7 +21,7 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid, list_grid, sample_grid, view_of
 from rf3dgs.field.lit import PARTS, LitSurface, Part
 from rf3dgs.field.radiance import Radiance, Surface
-from rf3dgs.field.rays import Rays
+from rf3dgs.field.rays import FARTHEST_LOBES, Rays
 from rf3dgs.field.sources import PointSources
 from rf3dgs.field.uncertainty import Uncertainty, numbers_of
 from rf3dgs.spectra.codec import DbWindow
@@ -222,7 +222,8 @@ class RadioField:
         surface = self.surface.radiance(self._channels(pose, grid, csi), pose.position)
         if self.sources is None:
             return surface
-        return with_rays(surface, self.sources.rays(pose.position, self.obstacles), pose, grid, self.instrument)
+        rays = self.sources.rays(pose.position, self.obstacles, within=_seen(pose, grid, self.instrument))
+        return with_rays(surface, rays, pose, grid, self.instrument)
 
     def _channels(self, pose: Pose, grid: DirectionGrid, csi: bool) -> Tensor:
         if grid.kind != "list":
@@ -278,12 +279,21 @@ class RadioField:
         return torch.cat((head, pose.to_world(directions), surface.aod[row, col], numbers), -1)
 
 
+def _seen(pose: Pose, grid: DirectionGrid, instrument: Instrument) -> tuple[Tensor, float] | None:
+    """A direction `[3]` of the world and the angle [rad] about it in which rays touch the grid; None for all around."""
+    middle, radius = grid.cone
+    reach = radius + FARTHEST_LOBES * instrument.lobe
+    return None if reach >= math.pi else (pose.to_world(middle), reach)
+
+
 def with_rays(surface: Radiance, rays: Rays, pose: Pose, grid: DirectionGrid, instrument: Instrument) -> Radiance:
     """The radiance of a surface and what arrives at `pose` from point sources, summed in linear power.
 
     Delay and departure, where the surface has them, are means weighted by power.
     """
     place, ray, share = rays.shares(pose, grid, instrument)
+    if surface.delay is None or surface.aod is None:
+        return Radiance(surface.power.flatten().index_add(0, place, share).reshape(surface.power.shape))
     touched = torch.zeros(grid.solid_angle.numel(), dtype=torch.bool)
     touched[place] = True
     pixels = torch.nonzero(touched).squeeze(1)
@@ -302,8 +312,6 @@ def with_rays(surface: Radiance, rays: Rays, pose: Pose, grid: DirectionGrid, in
     before = surface.power.flatten()[pixels]
     power = before + summed(share)
     whole = changed(surface.power, power)
-    if surface.delay is None or surface.aod is None:
-        return Radiance(whole)
     power = power.clamp_min(torch.finfo(power.dtype).tiny)
     delay = (before * surface.delay.flatten()[pixels] + summed(share * rays.delay[ray])) / power
     aod = before[:, None] * surface.aod.flatten(0, 1)[pixels] + summed(share[:, None] * rays.departure[ray])

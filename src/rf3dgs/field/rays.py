@@ -46,13 +46,10 @@ class Rays:
         cut, blocks = min(math.pi, FARTHEST_LOBES * instrument.lobe), grid.blocks
         arrival = pose.to_device(self.arrival)
         block, ray = blocks.near(arrival, cut)
-        chord2 = (blocks.directions[block] - arrival[ray, :, None]).square_().sum(1)
-        row, pixel = torch.nonzero(chord2 <= 4.0 * math.sin(0.5 * cut) ** 2, as_tuple=True)
-        place = blocks.pixels[block[row], pixel]
-        within = place >= 0
-        row, pixel, place = row[within], pixel[within], place[within]
-        angle = 2.0 * torch.asin((0.5 * chord2[row, pixel].sqrt()).clamp_max(1.0))
-        ray = ray[row]
+        chord2 = (blocks.directions[block] - arrival[ray, :, None]).square_().sum(1).flatten()
+        near = torch.nonzero(chord2 <= 4.0 * math.sin(0.5 * cut) ** 2).squeeze(1)
+        angle = 2.0 * torch.asin((0.5 * chord2[near].sqrt_()).clamp_max_(1.0))
+        place, ray = blocks.pixels[block].flatten()[near], ray[near // blocks.pixels.shape[1]]
         return place, ray, instrument.kernel(angle) * self.power[ray]
 
     def picture(self, pose: Pose, grid: DirectionGrid, instrument: Instrument) -> Tensor:
