@@ -10,7 +10,7 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid, list_grid, pinhole_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.field.radiance import Radiance, Surface
-from rf3dgs.field.radio_field import with_rays
+from rf3dgs.field.radio_field import add_rays
 from rf3dgs.splats.gaussians import Gaussians
 
 HERE = Pose.from_yaw([4.0, 3.0, 1.4], 0.7)
@@ -82,8 +82,8 @@ def test_a_picture_asks_only_for_sources_that_it_may_show(field, yaw, csi):
     pose, grid = Pose.from_yaw(HERE.position, yaw), pinhole_grid(30, 20, 70.0)
     every = field.sources.rays(pose.position, field.obstacles)
     surface = field.without_sources().render(pose, grid, csi=csi)
-    bare = Radiance(surface.power, surface.delay, surface.aod)
-    expected, shown = with_rays(bare, every, pose, grid, field.instrument), field.render(pose, grid, csi=csi)
+    expected, shown = Radiance(surface.power, surface.delay, surface.aod), field.render(pose, grid, csi=csi)
+    add_rays(expected, every, pose, grid, field.instrument)
     for name in ("power", "delay", "aod"):
         torch.testing.assert_close(getattr(shown, name), getattr(expected, name), rtol=1e-6, atol=0)
 

@@ -223,7 +223,8 @@ class RadioField:
         if self.sources is None:
             return surface
         rays = self.sources.rays(pose.position, self.obstacles, within=_seen(pose, grid, self.instrument))
-        return with_rays(surface, rays, pose, grid, self.instrument)
+        add_rays(surface, rays, pose, grid, self.instrument)
+        return surface
 
     def _channels(self, pose: Pose, grid: DirectionGrid, csi: bool) -> Tensor:
         if grid.kind != "list":
@@ -286,34 +287,28 @@ def _seen(pose: Pose, grid: DirectionGrid, instrument: Instrument) -> tuple[Tens
     return None if reach >= math.pi else (pose.to_world(middle), reach)
 
 
-def with_rays(surface: Radiance, rays: Rays, pose: Pose, grid: DirectionGrid, instrument: Instrument) -> Radiance:
-    """The radiance of a surface and what arrives at `pose` from point sources, summed in linear power.
+def add_rays(surface: Radiance, rays: Rays, pose: Pose, grid: DirectionGrid, instrument: Instrument) -> None:
+    """Add what arrives at `pose` from point sources to the radiance of a surface, in linear power, in place.
 
-    Delay and departure, where the surface has them, are means weighted by power.
+    Delay and departure, where the surface has them, become means weighted by power.
     """
-    place, ray, share = rays.shares(pose, grid, instrument)
+    place, ray, share = (part.numpy() for part in rays.shares(pose, grid, instrument))
+    power = surface.power.numpy().reshape(-1)
     if surface.delay is None or surface.aod is None:
-        return Radiance(surface.power.flatten().index_add(0, place, share).reshape(surface.power.shape))
-    touched = torch.zeros(grid.solid_angle.numel(), dtype=torch.bool)
+        np.add.at(power, place, share)
+        return
+    touched = np.zeros(len(power), dtype=bool)
     touched[place] = True
-    pixels = torch.nonzero(touched).squeeze(1)
-    row = torch.empty(len(touched), dtype=torch.long)
-    row[pixels] = torch.arange(len(pixels))
-    row = row[place]
+    pixels, row = np.flatnonzero(touched), (np.cumsum(touched) - 1)[place]
 
-    def summed(what: Tensor) -> Tensor:
-        return what.new_zeros(len(pixels), *what.shape[1:]).index_add_(0, row, what)
+    def summed(what: np.ndarray) -> np.ndarray:
+        return np.bincount(row, share * what[ray], len(pixels)).astype(np.float32)
 
-    def changed(of: Tensor, to: Tensor) -> Tensor:
-        flat = of.flatten(0, 1).clone()
-        flat[pixels] = to
-        return flat.reshape(of.shape)
-
-    before = surface.power.flatten()[pixels]
-    power = before + summed(share)
-    whole = changed(surface.power, power)
-    power = power.clamp_min(torch.finfo(power.dtype).tiny)
-    delay = (before * surface.delay.flatten()[pixels] + summed(share * rays.delay[ray])) / power
-    aod = before[:, None] * surface.aod.flatten(0, 1)[pixels] + summed(share[:, None] * rays.departure[ray])
-    aod = torch.nn.functional.normalize(aod / power[:, None], dim=-1, eps=1e-9)
-    return Radiance(whole, changed(surface.delay, delay), changed(surface.aod, aod))
+    before = power[pixels]
+    np.add.at(power, place, share)
+    whole = np.maximum(power[pixels], np.finfo(np.float32).tiny)
+    delay, aod = surface.delay.numpy().reshape(-1), surface.aod.numpy().reshape(-1, 3)
+    delay[pixels] = (before * delay[pixels] + summed(rays.delay.numpy())) / whole
+    departure = np.stack([summed(axis) for axis in rays.departure.numpy().T], -1)
+    departure = (before[:, None] * aod[pixels] + departure) / whole[:, None]
+    aod[pixels] = departure / np.maximum(np.linalg.norm(departure, axis=-1, keepdims=True), 1e-9)
