@@ -51,10 +51,11 @@ class Data:
     digest: str
 
     def training(self, count: int, seed: int) -> Spectrum:
-        """The spectra `[count, row, col]` of the training positions."""
+        """The spectra `[count, row, col]` of the training positions, but for those that hear nothing at all."""
         pool = self.dataset.train
         assert pool.spectra is not None
-        return pool.spectra[torch.isin(pool.index, torch.from_numpy(self.split.training(count, seed)))]
+        chosen = torch.isin(pool.index, torch.from_numpy(self.split.training(count, seed)))
+        return pool.spectra[chosen & (pool.spectra.power.amax((-2, -1)) > 0)]
 
     def window(self) -> DbWindow:
         """The dB window of every score: that of the whole pool, so that it depends on neither model nor cell.
