@@ -135,3 +135,20 @@ def test_blocks_hold_every_pixel_once_and_find_those_near(grid):
     found = {(place, who) for at, who in zip(block, row.tolist(), strict=True) for place in blocks.pixels[at].tolist()}
     angle = angle_between(*torch.broadcast_tensors(grid.directions.reshape(-1, 1, 3), asked))
     assert {(int(place), int(who)) for place, who in torch.nonzero(angle <= 0.2)} <= found
+
+
+@pytest.mark.parametrize("grid", [equirect_grid(30, 15), pinhole_grid(30, 20, 90.0), list_grid(torch.eye(3)[:1])])
+def test_a_cone_holds_every_direction_and_is_no_wider(grid) -> None:
+    middle, radius = grid.cone
+    farthest = float((grid.directions @ middle).amin().clamp(-1.0, 1.0).arccos())
+    if grid.kind == "equirect":
+        assert radius == math.pi
+    else:
+        assert farthest == pytest.approx(radius, abs=1e-3)  # an arccos near 1 in float32
+
+
+@pytest.mark.parametrize("grid", [pinhole_grid(30, 20, 90.0), list_grid(torch.eye(3))])
+def test_a_pixel_that_does_not_exist_is_near_nothing(grid) -> None:
+    missing = grid.blocks.directions.mT[grid.blocks.pixels < 0]
+    assert len(missing)
+    assert float(torch.linalg.vector_norm(missing, dim=-1).min()) > 3.0  # a chord of the sphere is 2 at most

@@ -240,6 +240,17 @@ def test_many_receivers_get_what_each_gets_alone(monkeypatch):
             assert torch.equal(rays.power, one.power)
 
 
+def test_rays_within_a_cone_are_those_of_all_that_arrive_there():
+    sources, here = box_sources(3), torch.tensor([4.0, 3.1, 1.4])
+    every, middle = sources.rays(here, FREE), torch.nn.functional.normalize(torch.tensor([1.0, -0.4, 0.3]), dim=0)
+    for angle in (0.4, 0.9, 1.5, 2.0):
+        found = sources.rays(here, FREE, within=(middle, angle))
+        inside = every.only(angle_between(every.arrival, middle.expand_as(every.arrival)) <= angle)
+        assert 0 < len(inside) < len(every)
+        for name in RAY_FIELDS:
+            assert torch.equal(getattr(found, name), getattr(inside, name))
+
+
 def test_nobody_to_ask_gives_no_rays():
     place, rays = box_sources(2).arrivals(torch.zeros(0, 3), FREE)
     assert len(place) == len(rays) == 0

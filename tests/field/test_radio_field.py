@@ -9,7 +9,8 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid, list_grid, pinhole_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
-from rf3dgs.field.radiance import Surface
+from rf3dgs.field.radiance import Radiance, Surface
+from rf3dgs.field.radio_field import add_rays
 from rf3dgs.splats.gaussians import Gaussians
 
 HERE = Pose.from_yaw([4.0, 3.0, 1.4], 0.7)
@@ -72,6 +73,19 @@ def test_power_of_parts_adds_linearly(field, sphere):
     louder = replace(field.sources, level_db=10 * math.log10(2))
     twice = replace(field, sources=louder).render(HERE, sphere).power
     torch.testing.assert_close(twice - whole, sources_only.render(HERE, sphere).power, atol=1e-16, rtol=1e-3)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, 1.6, 2.6, -2.2, -1.2])
+@pytest.mark.parametrize("csi", [False, True])
+def test_a_picture_asks_only_for_sources_that_it_may_show(field, yaw, csi):
+    """It is the same as with all rays, at all sides of the picture and with none in it."""
+    pose, grid = Pose.from_yaw(HERE.position, yaw), pinhole_grid(30, 20, 70.0)
+    every = field.sources.rays(pose.position, field.obstacles)
+    surface = field.without_sources().render(pose, grid, csi=csi)
+    expected, shown = Radiance(surface.power, surface.delay, surface.aod), field.render(pose, grid, csi=csi)
+    add_rays(expected, every, pose, grid, field.instrument)
+    for name in ("power", "delay", "aod"):
+        torch.testing.assert_close(getattr(shown, name), getattr(expected, name), rtol=1e-6, atol=0)
 
 
 def test_delay_and_departure_are_weighted_by_power(field, sphere):

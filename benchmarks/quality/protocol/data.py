@@ -59,11 +59,12 @@ class Data:
         return self.dataset.pose.position[:: self.views]
 
     def training(self, count: int, seed: int, draw: Draw = "uniform") -> Spectrum:
-        """The pictures `[count x views, row, col]` of the training positions."""
+        """The pictures `[count x views, row, col]` of the training positions, but for those that hear nothing at all."""
         pool = self.dataset.train
         assert pool.spectra is not None
         chosen = self.split.training(count, seed, draw, self.positions[:, :2].double().numpy())
-        return pool.spectra[torch.isin(pool.index // self.views, torch.from_numpy(chosen))]
+        ours = torch.isin(pool.index // self.views, torch.from_numpy(chosen))
+        return pool.spectra[ours & (pool.spectra.power.amax((-2, -1)) > 0)]
 
     def window(self) -> DbWindow:
         """The dB window of every score: that of the whole pool, so that it depends on neither model nor cell.

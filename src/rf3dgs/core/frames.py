@@ -6,6 +6,7 @@ OpenGL camera: x right, y up, z backward. Matrices are named `target_from_source
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -158,9 +159,9 @@ class Pose:
         generator = torch.Generator().manual_seed(seed)
         return cls(low + (high - low) * torch.rand(count, 3, generator=generator))
 
-    @property
+    @cached_property
     def world_from_device(self) -> Tensor:
-        """Rotation `[*batch, 3, 3]`."""
+        """Rotation `[*batch, 3, 3]`; not to be changed in place."""
         return matrix_from_quaternion(self.orientation)
 
     @property

@@ -17,6 +17,7 @@ from rf3dgs.core.frames import CAMERA_FROM_DEVICE, Pose
 
 MAX_PIXELS = 64_000_000
 BLOCK = 12  # pixels on a side of the blocks that tell which pixels are near a direction
+NOWHERE = 9.0  # each coordinate of the direction of a pixel that does not exist: far from every unit vector
 GridKind = Literal["pinhole", "equirect", "list"]
 
 
@@ -24,8 +25,9 @@ GridKind = Literal["pinhole", "equirect", "list"]
 class Blocks:
     """Small blocks of neighbouring pixels of a grid.
 
-    pixels `[block, pixel]`: places in the flattened grid, -1 is none. directions `[block, 3, pixel]`: theirs. middles
-    `[block, 3]`: unit vectors. radius `[block]` [rad]: how far pixels are from it; pi of a block around the sphere.
+    pixels `[block, pixel]`: places in the flattened grid, -1 is none. directions `[block, 3, pixel]`: theirs, `NOWHERE`
+    where there is none. middles `[block, 3]`: unit vectors. radius `[block]` [rad]: how far pixels are from it; pi of a
+    block around the sphere.
     """
 
     pixels: Tensor
@@ -87,7 +89,18 @@ class DirectionGrid:
         middles = members.mean(1)
         radius = angle_between(members, middles[:, None].expand_as(members)).amax(1)
         radius = torch.where(torch.linalg.vector_norm(middles, dim=-1) < 0.01, torch.full_like(radius, math.pi), radius)
+        members = torch.where(pixels[..., None] < 0, torch.full_like(members, NOWHERE), members)
         return Blocks(pixels, members.mT.contiguous(), torch.nn.functional.normalize(middles, dim=-1), radius)
+
+    @cached_property
+    def cone(self) -> tuple[Tensor, float]:
+        """A direction `[3]` and the angle [rad] about it that holds all directions; pi where they lie all around."""
+        every = self.directions.reshape(-1, 3)
+        middle = every.mean(0)
+        if float(torch.linalg.vector_norm(middle)) < 0.01:
+            return torch.tensor([1.0, 0.0, 0.0]), math.pi
+        middle = torch.nn.functional.normalize(middle, dim=0)
+        return middle, float(angle_between(every, middle.expand_as(every)).amax())
 
     def same_as(self, other: "DirectionGrid") -> bool:
         """True when both grids look in the same directions, pixel by pixel."""

@@ -21,7 +21,7 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid, equirect_grid, list_grid, sample_grid, view_of
 from rf3dgs.field.lit import PARTS, LitSurface, Part
 from rf3dgs.field.radiance import Radiance, Surface
-from rf3dgs.field.rays import Rays
+from rf3dgs.field.rays import FARTHEST_LOBES, Rays
 from rf3dgs.field.sources import PointSources
 from rf3dgs.field.uncertainty import Uncertainty, numbers_of
 from rf3dgs.spectra.codec import DbWindow
@@ -222,7 +222,9 @@ class RadioField:
         surface = self.surface.radiance(self._channels(pose, grid, csi), pose.position)
         if self.sources is None:
             return surface
-        return with_rays(surface, self.sources.rays(pose.position, self.obstacles), pose, grid, self.instrument)
+        rays = self.sources.rays(pose.position, self.obstacles, within=_seen(pose, grid, self.instrument))
+        add_rays(surface, rays, pose, grid, self.instrument)
+        return surface
 
     def _channels(self, pose: Pose, grid: DirectionGrid, csi: bool) -> Tensor:
         if grid.kind != "list":
@@ -278,34 +280,35 @@ class RadioField:
         return torch.cat((head, pose.to_world(directions), surface.aod[row, col], numbers), -1)
 
 
-def with_rays(surface: Radiance, rays: Rays, pose: Pose, grid: DirectionGrid, instrument: Instrument) -> Radiance:
-    """The radiance of a surface and what arrives at `pose` from point sources, summed in linear power.
+def _seen(pose: Pose, grid: DirectionGrid, instrument: Instrument) -> tuple[Tensor, float] | None:
+    """A direction `[3]` of the world and the angle [rad] about it in which rays touch the grid; None for all around."""
+    middle, radius = grid.cone
+    reach = radius + FARTHEST_LOBES * instrument.lobe
+    return None if reach >= math.pi else (pose.to_world(middle), reach)
 
-    Delay and departure, where the surface has them, are means weighted by power.
+
+def add_rays(surface: Radiance, rays: Rays, pose: Pose, grid: DirectionGrid, instrument: Instrument) -> None:
+    """Add what arrives at `pose` from point sources to the radiance of a surface, in linear power, in place.
+
+    Delay and departure, where the surface has them, become means weighted by power.
     """
-    place, ray, share = rays.shares(pose, grid, instrument)
-    touched = torch.zeros(grid.solid_angle.numel(), dtype=torch.bool)
-    touched[place] = True
-    pixels = torch.nonzero(touched).squeeze(1)
-    row = torch.empty(len(touched), dtype=torch.long)
-    row[pixels] = torch.arange(len(pixels))
-    row = row[place]
-
-    def summed(what: Tensor) -> Tensor:
-        return what.new_zeros(len(pixels), *what.shape[1:]).index_add_(0, row, what)
-
-    def changed(of: Tensor, to: Tensor) -> Tensor:
-        flat = of.flatten(0, 1).clone()
-        flat[pixels] = to
-        return flat.reshape(of.shape)
-
-    before = surface.power.flatten()[pixels]
-    power = before + summed(share)
-    whole = changed(surface.power, power)
+    place, ray, share = (part.numpy() for part in rays.shares(pose, grid, instrument))
+    power = surface.power.numpy().reshape(-1)
     if surface.delay is None or surface.aod is None:
-        return Radiance(whole)
-    power = power.clamp_min(torch.finfo(power.dtype).tiny)
-    delay = (before * surface.delay.flatten()[pixels] + summed(share * rays.delay[ray])) / power
-    aod = before[:, None] * surface.aod.flatten(0, 1)[pixels] + summed(share[:, None] * rays.departure[ray])
-    aod = torch.nn.functional.normalize(aod / power[:, None], dim=-1, eps=1e-9)
-    return Radiance(whole, changed(surface.delay, delay), changed(surface.aod, aod))
+        np.add.at(power, place, share)
+        return
+    touched = np.zeros(len(power), dtype=bool)
+    touched[place] = True
+    pixels, row = np.flatnonzero(touched), (np.cumsum(touched) - 1)[place]
+
+    def summed(what: np.ndarray) -> np.ndarray:
+        return np.bincount(row, share * what[ray], len(pixels)).astype(np.float32)
+
+    before = power[pixels]
+    np.add.at(power, place, share)
+    whole = np.maximum(power[pixels], np.finfo(np.float32).tiny)
+    delay, aod = surface.delay.numpy().reshape(-1), surface.aod.numpy().reshape(-1, 3)
+    delay[pixels] = (before * delay[pixels] + summed(rays.delay.numpy())) / whole
+    departure = np.stack([summed(axis) for axis in rays.departure.numpy().T], -1)
+    departure = (before[:, None] * aod[pixels] + departure) / whole[:, None]
+    aod[pixels] = departure / np.maximum(np.linalg.norm(departure, axis=-1, keepdims=True), 1e-9)

@@ -1,8 +1,13 @@
-"""Rays: what arrives at a receiver from point sources, and what an instrument there sees of it."""
+"""Rays: what arrives at a receiver from point sources, and what an instrument there sees of it.
+
+Pixels near a ray are sought in NumPy: a hundred blocks of pixels are just so many that torch would wake other threads
+for each step, which costs more than the step.
+"""
 
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -46,13 +51,13 @@ class Rays:
         cut, blocks = min(math.pi, FARTHEST_LOBES * instrument.lobe), grid.blocks
         arrival = pose.to_device(self.arrival)
         block, ray = blocks.near(arrival, cut)
-        chord2 = (blocks.directions[block] - arrival[ray, :, None]).square_().sum(1)
-        row, pixel = torch.nonzero(chord2 <= 4.0 * math.sin(0.5 * cut) ** 2, as_tuple=True)
-        place = blocks.pixels[block[row], pixel]
-        within = place >= 0
-        row, pixel, place = row[within], pixel[within], place[within]
-        angle = 2.0 * torch.asin((0.5 * chord2[row, pixel].sqrt()).clamp_max(1.0))
-        ray = ray[row]
+        rows = block.numpy()
+        apart = blocks.directions.numpy()[rows] - arrival.numpy()[ray.numpy(), :, None]
+        chord2 = np.einsum("bip,bip->bp", apart, apart).ravel()
+        near = np.flatnonzero(chord2 <= 4.0 * math.sin(0.5 * cut) ** 2)
+        angle = torch.from_numpy(2.0 * np.arcsin(np.minimum(0.5 * np.sqrt(chord2[near]), 1.0)))
+        place = torch.from_numpy(blocks.pixels.numpy()[rows].ravel()[near])
+        ray = ray[torch.from_numpy(near // blocks.pixels.shape[1])]
         return place, ray, instrument.kernel(angle) * self.power[ray]
 
     def picture(self, pose: Pose, grid: DirectionGrid, instrument: Instrument) -> Tensor:

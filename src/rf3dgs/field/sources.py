@@ -5,6 +5,7 @@ departure and delay are exact, its power has a few learned numbers (docs/theory/
 receiver is decided by geometry: every reflection falls on surface, and every leg of the way is open.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,6 +21,7 @@ from rf3dgs.field.ways import Plan, Ways, ways_over
 from rf3dgs.geometry import Patches, Planes
 from rf3dgs.splats.obstacles import Obstacles
 
+ROUNDING = 1e-5  # of a cosine in float32
 MARK_PRIOR = 0.05  # weight of no deviation beside marks of weight 1 where they are
 AT_ONCE = 256  # receivers
 
@@ -176,9 +178,19 @@ class PointSources:
         legs = self.plan.order[ways.source] + 1
         return passed.numpy().reshape(-1, longest + 1).prod(-1) ** (1 / legs)
 
-    def rays(self, receiver: Tensor, obstacles: Obstacles) -> Rays:
-        """What reaches a receiver at `receiver` `[3]` [m]."""
-        return self.arrivals(receiver[None], obstacles)[1]
+    def rays(self, receiver: Tensor, obstacles: Obstacles, *, within: tuple[Tensor, float] | None = None) -> Rays:
+        """What reaches a receiver at `receiver` `[3]` [m].
+
+        `within`, a direction `[3]` of the world and an angle [rad] about it, leaves out what arrives from elsewhere.
+        """
+        (part,) = _positions(receiver[None])
+        ways = ways_over(self.plan, part, None if within is None else self._towards(part[0], *within))
+        return self._rays_of(ways.only(self.transmittance(ways, part, obstacles) > self.open_above))
+
+    def _towards(self, receiver: np.ndarray, direction: Tensor, angle: float) -> np.ndarray:
+        """True `[K]` for sources that a receiver `[3]` sees within `angle` [rad] of a unit vector `[3]`."""
+        line = self.plan.chain[:, -1] - receiver
+        return line @ direction.double().numpy() >= (math.cos(angle) - ROUNDING) * np.sqrt((line * line).sum(-1))
 
     def rays_each(self, receivers: Tensor, obstacles: Obstacles, *, in_sight: Tensor | None = None) -> list[Rays]:
         """What reaches each of the receivers `[n, 3]` [m]; `in_sight` `[n]` decides the line of sight where given."""

@@ -113,10 +113,14 @@ class Plan:
         return cls(images, rows, order, n, d, None if patches is None else Reach.of(patches), last, side)
 
 
-def ways_over(plan: Plan, receivers: np.ndarray) -> Ways:
-    """All ways of a plan to receivers `[n, 3]` [m] whose every point lies between its neighbours and on surface."""
+def ways_over(plan: Plan, receivers: np.ndarray, asked: np.ndarray | None = None) -> Ways:
+    """All ways of a plan to receivers `[n, 3]` [m] whose every point lies between its neighbours and on surface.
+
+    `asked` `[K]`, where given, is False for sources that are left out.
+    """
     height = receivers @ plan.normals.T - plan.offsets
-    place, source = np.nonzero(height[:, plan.last] * plan.side < 0.0)
+    facing = height[:, plan.last] * plan.side < 0.0
+    place, source = np.nonzero(facing if asked is None else facing & asked)
     here = receivers[place]
     points, cosine = np.repeat(here[:, None], HIGHEST_ORDER, 1), np.ones((len(place), HIGHEST_ORDER))
     for step in reversed(range(int(plan.order.max()))):
