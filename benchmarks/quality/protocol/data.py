@@ -59,7 +59,7 @@ class Data:
         return self.dataset.pose.position[:: self.views]
 
     def training(self, count: int, seed: int, draw: Draw = "uniform") -> Spectrum:
-        """The pictures `[count x views, row, col]` of the training positions, but for those that hear nothing at all."""
+        """The pictures `[at most count x views, row, col]` of the training positions that show anything."""
         pool = self.dataset.train
         assert pool.spectra is not None
         chosen = self.split.training(count, seed, draw, self.positions[:, :2].double().numpy())

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from rf3dgs.evaluation.baselines.line_of_sight import LineOfSight as LineOfSight
     from rf3dgs.evaluation.baselines.lookup import InverseDistance as InverseDistance
     from rf3dgs.evaluation.baselines.lookup import NearestNeighbour as NearestNeighbour
+    from rf3dgs.evaluation.baselines.nerf2 import Nerf2 as Nerf2
+    from rf3dgs.evaluation.baselines.nerf2 import fit_nerf2 as fit_nerf2
+    from rf3dgs.evaluation.baselines.nerf2_config import Nerf2Config as Nerf2Config
     from rf3dgs.evaluation.baselines.path_loss import PathLossPredictor as PathLossPredictor
     from rf3dgs.evaluation.baselines.published import PublishedConfig as PublishedConfig
     from rf3dgs.evaluation.baselines.published import PublishedField as PublishedField
@@ -31,6 +34,9 @@ _HOMES = {
     "fit_published": ".published",
     "PublishedConfig": ".published",
     "PublishedField": ".published",
+    "fit_nerf2": ".nerf2",
+    "Nerf2": ".nerf2",
+    "Nerf2Config": ".nerf2_config",
     "fit_cgan": ".cgan",
     "Cgan": ".cgan",
     "CganConfig": ".cgan_config",
@@ -49,6 +55,9 @@ __all__ = [  # noqa: RUF022 (reading order)
     "fit_published",
     "PublishedConfig",
     "PublishedField",
+    "fit_nerf2",
+    "Nerf2",
+    "Nerf2Config",
     "fit_cgan",
     "Cgan",
     "CganConfig",
