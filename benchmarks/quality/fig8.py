@@ -35,8 +35,7 @@ ALL, SOME, ONE = "every count", "some counts", "one count"
 METHODS: Mapping[str, str] = {
     **dict.fromkeys(("nearest", "idw4", "linear", "constant", "mirror"), ALL),
     **dict.fromkeys(("paper", "rf3dgs-jet", "rf3dgs-db", "nerf2", "nerf2-db", "cgan"), SOME),
-    **dict.fromkeys(("los", "friis", "log-distance", "itu-indoor", "tr38901-inh"), ONE),
-    **dict.fromkeys(("twin-2cm", "twin-5cm", "twin-10cm", "twin-materials"), ONE),
+    **dict.fromkeys(("los", "tr38901-inh", "twin-2cm", "twin-5cm", "twin-10cm", "twin-materials"), ONE),
 }
 """How often each method is trained; those that learn little or nothing, once."""
 

@@ -27,7 +27,7 @@ from typing import Any
 import torch
 
 from benchmarks.quality.methods.method import SCALES, Method, Scale, Task
-from benchmarks.quality.radiance.split import split_of
+from benchmarks.quality.protocol.split import split_of
 from rf3dgs.channel.io import PathsReader
 from rf3dgs.channel.paths import Paths
 from rf3dgs.core.errors import InputError, RfError

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.quality.radiance.split import SplitConfig, split_of
+from benchmarks.quality.protocol.split import SplitConfig, split_of
 from rf3dgs.channel.io import PathsReader
 from rf3dgs.channel.paths import Paths
 from rf3dgs.core.errors import InputError

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from benchmarks.quality.radiance.split import split_of
+from benchmarks.quality.protocol.split import split_of
 from benchmarks.quality.recipe import MODELS, main, put_into, values_of
 from benchmarks.quality.recipe_data import pictures_of
 from benchmarks.quality.recipe_table import differences
