@@ -49,10 +49,11 @@ SIZES: Mapping[Scale, Size] = {
 
 
 def parser_of(doc: str | None, name: str) -> argparse.ArgumentParser:
-    """The options that every figure has."""
-    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """The options that every figure has; figures that share a folder share data and cells."""
+    how, prog = argparse.RawDescriptionHelpFormatter, f"python -m benchmarks.quality.{name}"
+    parser = argparse.ArgumentParser(prog, description=doc, formatter_class=how)
     parser.add_argument("--scale", choices=SCALES, default="laptop", help="minutes, hours on two cores, or a GPU")
-    parser.add_argument("--out", type=Path, default=Path("out") / name, help="data, cells and results; kept")
+    parser.add_argument("--out", type=Path, default=Path("out/figures"), help="data, cells and results; kept")
     parser.add_argument("--paths", type=Path, help="what rf3dgs trace lobby --preset paper wrote; traced when missing")
     parser.add_argument("--geometry", help="photos, mesh, or a .ply file; photos unless at smoke")
     parser.add_argument("--read-test", action="store_true", help="judge by the sealed positions; logged")
