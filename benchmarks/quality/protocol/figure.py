@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from benchmarks.quality.methods.method import SCALES, Scale
-from benchmarks.quality.protocol.cells import commit, machine
+from benchmarks.quality.protocol.cells import Extra, commit, machine
 from benchmarks.quality.protocol.pictures import Pictures, pinholes
 from benchmarks.quality.protocol.split import SplitConfig
 from benchmarks.quality.protocol.study import Study, StudyConfig
@@ -52,7 +52,7 @@ def parser_of(doc: str | None, name: str) -> argparse.ArgumentParser:
     """The options that every figure has."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scale", choices=SCALES, default="laptop", help="minutes, hours on two cores, or a GPU")
-    parser.add_argument("--out", type=Path, default=Path("out") / name, help="data, cells and results; kept")
+    parser.add_argument("--out", type=Path, default=Path("out/figures"), help="data, cells and results; kept, shared")
     parser.add_argument("--paths", type=Path, help="what rf3dgs trace lobby --preset paper wrote; traced when missing")
     parser.add_argument("--geometry", help="photos, mesh, or a .ply file; photos unless at smoke")
     parser.add_argument("--read-test", action="store_true", help="judge by the sealed positions; logged")
@@ -69,10 +69,13 @@ def study_of(
     method: SpectrumMethod = "ideal",
     pictures: Pictures | None = None,
     holdouts: Sequence[str] = ("random", "region"),
+    extra: Extra | None = None,
+    keep: int = 0,
 ) -> Study:
     """The study of the lobby at the asked scale, seen by four pinholes a position unless `pictures` says otherwise.
 
-    split "paper" is judged by its test alone, which needs `--read-test`. Each split and method has a folder of its own.
+    split "paper" is judged by its test alone, which needs `--read-test`. Each split and method has a folder of its own,
+    which figures share where they share `--out`. extra and keep: as in `StudyConfig`.
     """
     size = SIZES[wish.scale]
     if split == "paper" and not wish.read_test:
@@ -96,6 +99,8 @@ def study_of(
             scale=wish.scale,
             paths={} if wish.paths is None else {PRESET: wish.paths},
             reason=lambda: f"benchmarks.quality.{name} at {commit()}, scale {wish.scale}",
+            extra=extra,
+            keep=keep,
         )
     )
 
