@@ -229,7 +229,10 @@ def main(words: Sequence[str] | None = None) -> None:
     rows: list[Row] = []
     seen: dict[SpectrumMethod, Seen] = {}
     ideal: Truth | None = None
-    for kind in (name for name in KINDS if name == "ideal" or name in wish.kinds):
+    asked = {"ideal", *wish.kinds}
+    for kind in KINDS:
+        if asked.isdisjoint({kind}):
+            continue
         home, found, seen[kind] = of_kind(wish, kind, ideal)
         ideal = home if ideal is None else ideal
         rows += found

@@ -52,10 +52,10 @@ def methods_at(scale: Scale) -> list[Method]:
 
 def study_for(wish: argparse.Namespace) -> Study:
     """The study whose cells have the scores of delay and departure."""
-    pool = study_of(wish, NAME).data.dataset.train.spectra
-    window = study_of(wish, NAME).data.window()
+    data = study_of(wish, NAME).data
+    pool = data.dataset.train.spectra
     assert pool is not None
-    encoding = PaperEncoding(window, PaperEncoding.of(pool).delay_span)
+    encoding = PaperEncoding(data.window(), PaperEncoding.of(pool).delay_span)
     return study_of(wish, NAME, extra=Extra(NAME, partial(csi_scores, encoding=encoding)), keep=4)
 
 
