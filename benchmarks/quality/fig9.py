@@ -7,7 +7,7 @@ level, its direction, its sharpness, its strongest beam), and scored. Methods: o
 does the score prefer the one whose beam loses less? docs/how-to/figures-9.md has what came out.
 """
 
-import io
+import argparse
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -21,8 +21,10 @@ from scipy.ndimage import gaussian_filter
 
 from benchmarks.quality.methods import known, methods_of
 from benchmarks.quality.methods.method import Scale
-from benchmarks.quality.protocol.cells import Truth
+from benchmarks.quality.protocol.cells import Extra, Key, Truth
 from benchmarks.quality.protocol.figure import made_by, page_or_sentence, parser_of, rows_of, study_of, write_json
+from benchmarks.quality.protocol.kept import kept_beside, kept_pictures
+from benchmarks.quality.protocol.panels import small_png
 from benchmarks.quality.protocol.results import Results
 from benchmarks.quality.protocol.study import Study, say
 from rf3dgs.core.errors import RfError
@@ -32,14 +34,22 @@ from rf3dgs.evaluation.figures import STYLE
 from rf3dgs.evaluation.pictures import coloured
 from rf3dgs.evaluation.scores import SCORE, Score
 from rf3dgs.spectra.codec import DbWindow
+from rf3dgs.spectra.spectrum import Spectrum
 
 METHODS = ("nearest", "constant", "rf3dgs-jet", "rf3dgs-db", "nerf2", "nerf2-db", "cgan", "mirror")
 POSITIONS: Mapping[Scale, int] = {"smoke": 8, "laptop": 40, "paper": 160}
 PICTURE_SCORES = ("psnr", "ssim", "flip", "lpips", "rmse_db", "wasserstein")
 PHYSICS = ("peak_median", "peak_within_1", "beam_loss_eigen", "path_gain")
 IN_PANEL = ("psnr", "ssim", "flip", "rmse_db", "peak_median", "beam_loss_eigen")
+KEPT = 160  # pictures, one of which is shown
 CLEAR_DB = 1.0  # two beam losses this far apart are told apart
+Values = Mapping[str, np.ndarray]
 Harm = Callable[[np.ndarray, np.random.Generator], np.ndarray]
+
+
+def no_more(truth: Spectrum, drawn: Spectrum, window: DbWindow) -> dict[str, torch.Tensor]:
+    """No scores but those of every figure; the cells that keep pictures have a folder of their own."""
+    return {}
 
 
 def offset(level: np.ndarray, random: np.random.Generator) -> np.ndarray:
@@ -127,9 +137,7 @@ def panels(truth: Truth, rows: Sequence[tuple[str, np.ndarray, Mapping[str, floa
         for axis, (name, power, values) in zip(axes, rows, strict=False):
             axis.imshow(coloured(window.encode(torch.from_numpy(np.array(power))).numpy()), interpolation="nearest")
             axis.set_title(f"{name}\n{caption(values, shown)}")
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png")
-    return buffer.getvalue()
+        return small_png(figure)
 
 
 def caption(values: Mapping[str, float], shown: Sequence[Score]) -> str:
@@ -153,7 +161,7 @@ def main(words: Sequence[str] | None = None) -> int:
     count = POSITIONS[wish.scale]
     try:
         methods = methods_of(names)
-        study = study_of(wish, "fig9", holdouts=("random",), keep=1_000_000)
+        study = study_of(wish, "fig9", holdouts=("random",), extra=Extra("fig9", no_more), keep=KEPT)
         judge = "test" if wish.read_test else "validation"
         results = Results([method.name for method in methods], judge, Path(study.config.geometry).stem, [wish.seed])
         study.add(results, methods, count, wish.seed)
@@ -184,7 +192,7 @@ def main(words: Sequence[str] | None = None) -> int:
             made_by("fig9", [wish.seed], words),
         ]
     )
-    draw(study, truth, methods, found, fitted, count, wish)
+    draw(study, results, found, wish)
     numbers = {"harmed": found, "methods": fitted, "misorders": shares, "facts": results.facts}
     write_json(wish.out / f"fig9-{wish.scale}.json", plain(numbers))
     print(text)
@@ -200,25 +208,25 @@ def plain(value):
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def draw(study: Study, truth: Truth, methods, found, fitted, count: int, wish) -> None:
+def draw(study: Study, results: Results, found: Mapping[str, Values], wish: argparse.Namespace) -> None:
     """The panels of the view whose strongest beam stands out most among those kept."""
-    level = db_from_power(truth.spectra.power).flatten(1)
+    truth = study.truth("random")
+    level = db_from_power(truth.spectra.power[:KEPT]).flatten(1)
     view = int((level.amax(1) - level.median(1).values).argmax())
-    one = truth.spectra.power[view].numpy()
-    random = np.random.default_rng(wish.seed)
-    floor = truth.window.floor_db
-    rows: list[tuple[str, np.ndarray, Mapping[str, float]]] = [("truth", one, {})]
-    shown = [
-        SCORE[key] for key in ("psnr", "ssim", "flip", "rmse_db", "peak_median", "beam_loss_eigen") if key in SCORE
-    ]
+    random, floor = np.random.default_rng(wish.seed), truth.window.floor_db
+    shown = [SCORE[key] for key in IN_PANEL if key in SCORE]
+    true_level = np.maximum(db_from_power(truth.spectra.power[view]).numpy(), floor)
+
+    def of_view(values: Values) -> dict[str, float]:
+        return {column: float(value[view]) for column, value in values.items()}
+
+    rows: list[tuple[str, np.ndarray, Mapping[str, float]]] = [("truth", truth.spectra.power[view].numpy(), {})]
     for name, (_, harm) in HARMS.items():
-        harmed_level = harm(np.maximum(db_from_power(truth.spectra.power[view]).numpy(), floor), random)
-        values = {column: float(value[view]) for column, value in found[name].items()}
-        rows.append((name, power_from_db(torch.from_numpy(harmed_level)).numpy(), values))
-    for method in methods:
-        if method.name in fitted:
-            values = {column: float(value[view]) for column, value in fitted[method.name].items()}
-            rows.append((method.name, study.kept(method, "random", count, wish.seed)[view], values))
+        rows.append((name, power_from_db(torch.from_numpy(harm(true_level, random))).numpy(), of_view(found[name])))
+    for fact in results.facts:
+        key = Key(**fact["key"])
+        power = kept_pictures(kept_beside(key.path(study.config.cells)), truth.spectra).power
+        rows.append((key.model, power[view].numpy(), of_view(results.values[results.places[0]][key.model][key.seed])))
     write_whole((wish.pictures or wish.out) / f"fig9-{wish.scale}.png", panels(truth, rows, shown))
 
 

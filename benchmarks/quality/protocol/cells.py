@@ -4,15 +4,15 @@ A cell holds every position's scores, what it cost, and what it was made from; o
 same is never made again.
 """
 
-import io
 import json
 import math
 import os
 import subprocess
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,13 @@ import torch
 from torch import Tensor
 
 from benchmarks.quality.methods.method import Method, Task
+from benchmarks.quality.protocol.kept import keep_pictures, kept_beside
+from benchmarks.quality.protocol.seen import seen
 from benchmarks.quality.protocol.split import Draw
 from rf3dgs.channel.arrays import planar_array
 from rf3dgs.core.files import write_whole
-from rf3dgs.core.npz import read_npz_array
 from rf3dgs.evaluation import beams
+from rf3dgs.evaluation.lpips import Lpips
 from rf3dgs.evaluation.protocol import Predictor, refuse_leak, score
 from rf3dgs.evaluation.provenance import processor, versions
 from rf3dgs.field.radio_field import RadioField
@@ -62,43 +64,74 @@ class Key:
         return folder / "cells" / self.judge / f"{self.scene}-{self.preset}" / name
 
 
+@dataclass(frozen=True)
+class Extra:
+    """Scores of a figure's own, beside those of every figure."""
+
+    name: str
+    """Cells that have them are kept under this name."""
+    of: Callable[[Spectrum, Spectrum, DbWindow], Mapping[str, Tensor]]
+    """Columns `[n]` from a truth `[n, row, col]`, what was drawn and the window."""
+
+
 @dataclass(frozen=True, eq=False)
 class Truth:
     """What a hold-out is judged by: `spectra` `[n, row, col]`, their covariances, the window.
 
-    views: pictures of a position, which follow each other.
+    views: pictures of a position, which follow each other. extra: more scores. keep: of the first so many pictures,
+    what a predictor draws is kept beside the cell.
     """
 
     spectra: Spectrum
     covariance: Tensor
     window: DbWindow
     views: int = 1
+    extra: Extra | None = None
+    keep: int = 0
 
     @classmethod
-    def of(cls, spectra: Spectrum, window: DbWindow, views: int = 1) -> "Truth":
-        return cls(spectra, beams.panel_covariance(spectra, ARRAY), window, views)
+    def of(
+        cls, spectra: Spectrum, window: DbWindow, views: int = 1, *, extra: Extra | None = None, keep: int = 0
+    ) -> "Truth":
+        return cls(spectra, beams.panel_covariance(spectra, ARRAY), window, views, extra, keep)
+
+    @property
+    def digest(self) -> str:
+        """What identifies the levels and the window."""
+        window = torch.tensor([self.window.floor_db, self.window.ceil_db])
+        return fingerprint((self.spectra.power, self.spectra.pose.position, window))
 
     def drawn(self, predictor: Predictor) -> Spectrum:
-        """What a predictor renders at every pose `[n, row, col]`."""
+        """What a predictor shows of every pose `[n, row, col]`, a field as the truth's instrument would see it."""
         with torch.no_grad():
-            poses = [self.spectra.pose[index] for index in range(len(self.spectra))]
-            return stack_spectra([predictor.render(pose, self.spectra.grid) for pose in poses])
+            return stack_spectra([seen(predictor, self.spectra[index]) for index in range(len(self.spectra))])
 
     def scored(self, drawn: Spectrum) -> Values:
         """Every picture's scores."""
+        return self._scores(self.spectra, self.covariance, drawn)
+
+    def _scores(self, truth: Spectrum, covariance: Tensor, drawn: Spectrum) -> Values:
         with torch.no_grad():
-            return score(self.spectra, drawn, self.covariance, self.window, ARRAY)
+            values = score(truth, drawn, covariance, self.window, ARRAY, lpips_of_user())
+            more = {} if self.extra is None else self.extra.of(truth, drawn, self.window)
+        return values | {name: value.double().numpy() for name, value in more.items()}
 
     def second(self, repeat: Spectrum) -> Values:
         """Scores of the second solve `[m, row, col]` of some of the positions, NaN at the others."""
         apart = torch.cdist(repeat.pose.position.double(), self.spectra.pose.position.double())
         place = apart.argmin(1) + torch.arange(len(repeat)) % self.views
-        found = score(self.spectra[place], repeat, self.covariance[place], self.window, ARRAY)
+        found = self._scores(self.spectra[place], self.covariance[place], repeat)
         values = {}
         for name, value in found.items():
             values[name] = np.full(len(self.spectra), math.nan)
             values[name][place.numpy()] = value
         return values
+
+
+@lru_cache(maxsize=1)
+def lpips_of_user() -> Lpips | None:
+    """LPIPS with the weights that RF3DGS_LPIPS names; None without."""
+    return Lpips.from_environment()
 
 
 def read_cell(path: Path, identity: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -126,9 +159,8 @@ def make_cells(
     truths: Mapping[str, Truth],
     identity: Mapping[str, Any],
     folder: Path,
-    keep: int = 0,
 ) -> None:
-    """Train a method once and write the cells `keys`, which differ in the hold-out alone; `keep` pictures stay."""
+    """Train a method once and write the cells `keys`, which differ in the hold-out alone."""
     train = task.spectra
     for key in keys:
         refuse_leak(train.pose.position, truths[key.holdout].spectra.pose.position)
@@ -144,22 +176,10 @@ def make_cells(
         drawn = truth.drawn(predictor)
         rendering = clock.lap() | {"pictures": len(drawn)}
         values = truth.scored(drawn)
-        if keep:
-            buffer = io.BytesIO()
-            np.savez_compressed(buffer, power=drawn.power[:keep].numpy())
-            write_whole(kept_path(key, folder), buffer.getvalue())
+        if truth.keep:
+            keep_pictures(kept_beside(key.path(folder)), drawn[: truth.keep])
         saw = {"trained": views_digest(train), "judged": views_digest(truth.spectra)}
         _write(key, values, identity, facts | {"rendering": rendering, "views": truth.views, "saw": saw}, folder)
-
-
-def kept_path(key: Key, folder: Path) -> Path:
-    """The file of the pictures that were kept of a cell."""
-    return key.path(folder).with_suffix(".npz")
-
-
-def kept(key: Key, folder: Path) -> np.ndarray:
-    """The power `[n, row, col]` of the pictures that were kept of a cell."""
-    return read_npz_array(kept_path(key, folder), "power")
 
 
 def views_digest(spectra: Spectrum) -> str:

@@ -4,17 +4,17 @@ import argparse
 import json
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from benchmarks.quality.methods.method import SCALES, Scale
-from benchmarks.quality.protocol.cells import commit, machine
+from benchmarks.quality.protocol.cells import Extra, commit, machine
 from benchmarks.quality.protocol.pictures import Pictures, pinholes
 from benchmarks.quality.protocol.split import SplitConfig
 from benchmarks.quality.protocol.study import Study, StudyConfig, say
-from rf3dgs.core.errors import InputError
+from rf3dgs.core.errors import InputError, RfError
 from rf3dgs.core.files import write_whole
 from rf3dgs.spectra.config import Method as SpectrumMethod
 
@@ -70,11 +70,13 @@ def study_of(
     method: SpectrumMethod = "ideal",
     pictures: Pictures | None = None,
     holdouts: Sequence[str] = ("random", "region"),
+    extra: Extra | None = None,
     keep: int = 0,
 ) -> Study:
     """The study of the lobby at the asked scale, seen by four pinholes a position unless `pictures` says otherwise.
 
-    split "paper" is judged by its test alone, which needs `--read-test`. Each split and method has a folder of its own.
+    split "paper" is judged by its test alone, which needs `--read-test`. Each split and method has a folder of its own,
+    which figures share where they share `--out`. extra and keep: as in `StudyConfig`.
     """
     size = SIZES[wish.scale]
     if split == "paper" and not wish.read_test:
@@ -96,9 +98,10 @@ def study_of(
             geometry_folder=wish.out / "geometry",
             mesh_count=size.mesh_count,
             scale=wish.scale,
-            keep=keep,
             paths={} if wish.paths is None else {PRESET: wish.paths},
             reason=lambda: f"benchmarks.quality.{name} at {commit()}, scale {wish.scale}",
+            extra=extra,
+            keep=keep,
         )
     )
 
@@ -135,6 +138,15 @@ def put_into(page: Path, name: str, text: str) -> None:
             f"{page} has no marks <!-- {name} --> and <!-- end of {name} -->; add them where tables belong"
         )
     write_whole(page, f"{head}{mark}\n{text}\n\n{end}{tail}".encode())
+
+
+def told(name: str, run: Callable[[], int]) -> int:
+    """The exit status of a run; what it refuses is told in one sentence."""
+    try:
+        return run()
+    except RfError as error:
+        say(f"{name}: {error}")
+        return 2
 
 
 def page_or_sentence(page: Path | None, name: str, text: str) -> int:

@@ -11,11 +11,19 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 
 from benchmarks.quality.methods.method import Method, Scale, Task
-from benchmarks.quality.protocol.cells import SECOND, Key, Truth, kept, kept_path, make_cells, make_second, read_cell
+from benchmarks.quality.protocol.cells import (
+    SECOND,
+    Extra,
+    Key,
+    Truth,
+    lpips_of_user,
+    make_cells,
+    make_second,
+    read_cell,
+)
 from benchmarks.quality.protocol.data import Data, data_of, geometry_digest, geometry_of, second_solve, spectra_at
 from benchmarks.quality.protocol.pictures import SPHERE, Pictures
 from benchmarks.quality.protocol.results import Results
@@ -62,10 +70,17 @@ class StudyConfig:
     """Folders of traced paths by preset, for the scene itself."""
     reason: Callable[[], str] = lambda: "a study"
     """Why the sealed positions are read, for the log."""
-    keep: int = 0
-    """Pictures of every cell, the first ones of its hold-out, that are kept beside it."""
     only_read: bool = False
     """Make no cell."""
+    extra: Extra | None = None
+    """More scores of every picture; cells that have them are in a folder of that name."""
+    keep: int = 0
+    """Of the first so many pictures of a hold-out, what every method draws is kept beside its cell."""
+
+    @property
+    def cells(self) -> Path:
+        """The folder of the cells."""
+        return self.out if self.extra is None else self.out / self.extra.name
 
 
 class Study:
@@ -107,14 +122,18 @@ class Study:
         """What identifies every cell of the study."""
         window = self.before.window()
         levels = [window.floor_db, window.ceil_db]
-        return {"data": [self.before.digest, self.data.digest], "window_db": levels, "judged": self.config.judged}
+        found = {"data": [self.before.digest, self.data.digest], "window_db": levels, "judged": self.config.judged}
+        lpips = lpips_of_user()
+        found |= {"keep": self.config.keep} if self.config.keep else {}
+        return found | ({} if lpips is None else {"lpips": lpips.network})
 
     def truth(self, holdout: str) -> Truth:
         """What a hold-out is judged by."""
         if holdout not in self._truths:
             config = self.config
             spectra = self.data.judged(config.judge, holdout, config.reason(), config.judged)
-            self._truths[holdout] = Truth.of(spectra, self.before.window(), self.data.views)
+            window, views = self.before.window(), self.data.views
+            self._truths[holdout] = Truth.of(spectra, window, views, extra=config.extra, keep=config.keep)
         return self._truths[holdout]
 
     def task(self, count: int, seed: int, draw: Draw = "uniform", *, geometry: bool = True) -> Task:
@@ -133,12 +152,16 @@ class Study:
         draw: Draw = "uniform",
         *,
         again: Sequence[str] = (),
+        also: Mapping[str, Truth] | None = None,
     ) -> None:
         """Make the missing cells of methods trained on the same positions, and those named `again`; add all to
-        `results`. A method that fails leaves its cells out and is reported."""
+        `results`. A method that fails leaves its cells out and is reported.
+
+        also: more truths, by a name that stands for the hold-out; one fit is judged by all.
+        """
         task = self.task(count, seed, draw, geometry=any("geometry" in method.needs for method in methods))
         for method in methods:
-            for key, cell in self._cells(method, count, task, draw, again=method.name in again):
+            for key, cell in self._cells(method, count, task, draw, also or {}, again=method.name in again):
                 results.add(key, cell)
 
     def add_second(self, results: Results, count: int) -> None:
@@ -147,7 +170,7 @@ class Study:
             config = self.config
             key = self._key(holdout, 0, 0, SECOND, "none", config.scene)
             identity = self.base | {"receivers": count}
-            if read_cell(key.path(config.out), identity) is None and not config.only_read:
+            if read_cell(key.path(config.cells), identity) is None and not config.only_read:
                 folder = self._folder(self.setting)
                 solved = second_solve(
                     self.data, folder, config.judge, count, pictures=config.pictures, rays=config.rays
@@ -156,20 +179,20 @@ class Study:
                 wanted = judged.spectra.pose.position
                 repeat = spectra_at(solved, config.judge, holdout, config.reason(), wanted)
                 if repeat is not None:
-                    make_second(key, judged, repeat, identity, config.out)
-            found = read_cell(key.path(config.out), identity)
+                    make_second(key, judged, repeat, identity, config.cells)
+            found = read_cell(key.path(config.cells), identity)
             if found is not None:
                 results.add_second(key, found)
 
     def _cells(
-        self, method: Method, count: int, task: Task, draw: Draw, *, again: bool
+        self, method: Method, count: int, task: Task, draw: Draw, also: Mapping[str, Truth], *, again: bool
     ) -> Iterator[tuple[Key, dict[str, Any]]]:
         config, bare = self.config, "geometry" not in method.needs
         kind = "none" if bare else Path(config.geometry).stem
         trained = self.before.setting.name
         keys = [
             replace(self._key(holdout, count, task.seed, method.name, kind, trained), draw=draw)
-            for holdout in config.holdouts
+            for holdout in (*config.holdouts, *also)
         ]
         identity = self.base | {
             "model": method.name,
@@ -177,31 +200,20 @@ class Study:
             "scale": config.scale,
             "geometry": None if bare or task.geometry is None else geometry_digest(task.geometry),
         }
-        missing = [key for key in keys if again or not self._is_there(key, identity)]
+        if also:
+            identity |= {"also": {name: truth.digest for name, truth in also.items()}}
+        missing = [key for key in keys if again or not read_cell(key.path(config.cells), identity)]
         if missing and not config.only_read:
             say(f"{config.preset} {config.judge} {count} positions, {draw}, seed {task.seed}: {method.name}")
-            truths = {key.holdout: self.truth(key.holdout) for key in missing}
+            truths = {key.holdout: also.get(key.holdout) or self.truth(key.holdout) for key in missing}
             try:
-                make_cells(missing, method, task, truths, identity, config.out, config.keep)
+                make_cells(missing, method, task, truths, identity, config.cells)
             except RfError as error:
                 say(f"{method.name} failed, its cells stay empty: {error}")
         for key in keys:
-            found = read_cell(key.path(config.out), identity)
+            found = read_cell(key.path(config.cells), identity)
             if found is not None:
                 yield key, found
-
-    def _is_there(self, key: Key, identity: Mapping[str, Any]) -> bool:
-        config = self.config
-        if config.keep and not kept_path(key, config.out).is_file():
-            return False
-        return read_cell(key.path(config.out), identity) is not None
-
-    def kept(self, method: Method, holdout: str, count: int, seed: int) -> np.ndarray:
-        """The power `[n, row, col]` of the kept pictures of a cell."""
-        config = self.config
-        kind = "none" if "geometry" not in method.needs else Path(config.geometry).stem
-        key = self._key(holdout, count, seed, method.name, kind, self.before.setting.name)
-        return kept(key, config.out)
 
     def _key(self, holdout: str, count: int, seed: int, model: str, geometry: str, trained: str) -> Key:
         config = self.config
