@@ -293,7 +293,7 @@ def add_rays(surface: Radiance, rays: Rays, pose: Pose, grid: DirectionGrid, ins
     Delay and departure, where the surface has them, become means weighted by power.
     """
     place, ray, share = (part.numpy() for part in rays.shares(pose, grid, instrument))
-    power = surface.power.numpy().reshape(-1)
+    power = surface.power.view(-1).numpy()
     if surface.delay is None or surface.aod is None:
         np.add.at(power, place, share)
         return
@@ -307,7 +307,7 @@ def add_rays(surface: Radiance, rays: Rays, pose: Pose, grid: DirectionGrid, ins
     before = power[pixels]
     np.add.at(power, place, share)
     whole = np.maximum(power[pixels], np.finfo(np.float32).tiny)
-    delay, aod = surface.delay.numpy().reshape(-1), surface.aod.numpy().reshape(-1, 3)
+    delay, aod = surface.delay.view(-1).numpy(), surface.aod.view(-1, 3).numpy()
     delay[pixels] = (before * delay[pixels] + summed(rays.delay.numpy())) / whole
     departure = np.stack([summed(axis) for axis in rays.departure.numpy().T], -1)
     departure = (before[:, None] * aod[pixels] + departure) / whole[:, None]
