@@ -8,14 +8,13 @@ from torch import Tensor
 from benchmarks.quality.protocol.cells import lpips_of_user
 from rf3dgs.core.angles import angle_between, angles_of
 from rf3dgs.evaluation import metrics
+from rf3dgs.evaluation.lpips import LEAST_SIDE
 from rf3dgs.evaluation.scores import Score
 from rf3dgs.spectra.codec import DbWindow, PaperEncoding
 from rf3dgs.spectra.spectrum import Spectrum
 
 CHANNELS = {1: "azimuth", 2: "zenith", 3: "delay"}
 """What each channel of the paper's encoding shows, beside the gain."""
-LPIPS_LEAST = 64
-"""Pixels a side that LPIPS needs."""
 
 
 def _published(name: str) -> tuple[Score, ...]:
@@ -56,7 +55,7 @@ def csi_scores(truth: Spectrum, drawn: Spectrum, window: DbWindow, *, encoding: 
         return {score.column: nothing for score in (*PUBLISHED, *PHYSICAL)}
     first, second = encoding.encode(truth), encoding.encode(drawn)
     weight, lpips, values = metrics.pixel_weight(truth.grid), lpips_of_user(), {}
-    if min(truth.grid.shape) < LPIPS_LEAST:
+    if min(truth.grid.shape) < LEAST_SIDE:
         lpips = None
     for channel, name in CHANNELS.items():
         one, other = first[..., channel], second[..., channel]

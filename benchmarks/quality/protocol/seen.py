@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from rf3dgs.evaluation.protocol import Predictor
 from rf3dgs.field.radiance import Radiance
-from rf3dgs.field.radio_field import RadioField, with_rays
+from rf3dgs.field.radio_field import RadioField, add_rays
 from rf3dgs.field.waves import seen_by_array
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 
@@ -34,7 +34,7 @@ def through(field: RadioField, truth: Spectrum) -> Spectrum:
     found = Radiance(bare.power * share, bare.delay, bare.aod)
     if field.sources is not None:
         rays = field.sources.rays(truth.pose.position, field.obstacles)
-        found = with_rays(found, rays, truth.pose, truth.grid, truth.instrument)
+        add_rays(found, rays, truth.pose, truth.grid, truth.instrument)
     return replace(bare, power=found.power, delay=found.delay, aod=found.aod, instrument=truth.instrument)
 
 
