@@ -63,6 +63,7 @@ class Run:
                 trained=wish.trained,
                 judge=wish.judge,
                 holdouts=tuple(wish.holdout),
+                judged=wish.judged,
                 split=SplitConfig(*held, buffer=site.buffer if wish.buffer is None else wish.buffer),
                 receivers=wish.receivers,
                 pictures=replace(SPHERE, size=tuple(wish.size)),
@@ -110,6 +111,7 @@ def asked(words: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--receivers", type=int, help="the first so many of the paths; the scene's own when missing")
     parser.add_argument("--held", nargs=4, type=int, metavar=("TEST", "REGION", "VALIDATION", "NEAR"), help="held out")
     parser.add_argument("--buffer", type=float, help="round both regions [m]")
+    parser.add_argument("--judged", type=int, help="of each hold-out the first so many positions; all when missing")
     parser.add_argument("--again", type=int, default=20, help="positions of each hold-out solved again; 0 for none")
     parser.add_argument("--size", nargs=2, type=int, default=SPHERE.size, help="columns and rows of the spheres")
     parser.add_argument("--draw", choices=get_args(Draw), default="uniform", help="how training positions lie")
