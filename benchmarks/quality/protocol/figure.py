@@ -53,7 +53,9 @@ def parser_of(doc: str | None, name: str, *, without: str = "traced") -> argpars
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scale", choices=SCALES, default="laptop", help="minutes, hours on two cores, or a GPU")
     parser.add_argument("--out", type=Path, default=Path("out") / name, help="data, cells and results; kept")
-    parser.add_argument("--paths", type=Path, help=f"what rf3dgs trace lobby --preset paper wrote; {without} when missing")
+    parser.add_argument(
+        "--paths", type=Path, help=f"what rf3dgs trace lobby --preset paper wrote; {without} when missing"
+    )
     parser.add_argument("--geometry", help="photos, mesh, or a .ply file; photos unless at smoke")
     parser.add_argument("--read-test", action="store_true", help="judge by the sealed positions; logged")
     parser.add_argument("--page", type=Path, help="put the tables into this page, between its marks")

@@ -16,7 +16,15 @@ import torch
 
 from benchmarks.quality.methods.method import Method, Scale, Task
 from benchmarks.quality.protocol.cells import SECOND, Key, Truth, kept, kept_path, make_cells, make_second, read_cell
-from benchmarks.quality.protocol.data import Data, data_of, geometry_digest, geometry_of, second_solve, spectra_at
+from benchmarks.quality.protocol.data import (
+    FIRST,
+    Data,
+    data_of,
+    geometry_digest,
+    geometry_of,
+    second_solve,
+    spectra_at,
+)
 from benchmarks.quality.protocol.pictures import SPHERE, Pictures
 from benchmarks.quality.protocol.results import Results
 from benchmarks.quality.protocol.scenes import Setting
@@ -94,6 +102,11 @@ class Study:
     def scene(self) -> Scene:
         """The scene with its preset's materials."""
         return preset_of(self.config.preset).applied(self.setting.scene())[0]
+
+    @property
+    def traced(self) -> Path:
+        """The folder of paths that the data are made from, receiver by receiver."""
+        return self.config.paths.get(self.config.preset) or self._folder(self.setting) / FIRST
 
     @cached_property
     def geometry(self) -> Gaussians:
