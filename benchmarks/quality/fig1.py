@@ -1,47 +1,33 @@
 """The paper's Fig. 1: one held-out view as photograph, as true spectrum, and as each method reconstructs it.
 
-    python -m benchmarks.quality.fig1 --scale smoke|laptop|paper --out out/fig1
+    python -m benchmarks.quality.fig1 --scale laptop --paths paper.paths
 
 Two groups of spectra, each learned by each method on its own: (b) ideal ones, (c) MVDR pictures of an 8x8 patch array.
-Writes fig1.png, fig1.md (the numbers) and fig1.json (the numbers and all that they were made from). A second run reuses
+Writes fig1-SCALE.png, .md (the numbers) and .json (the numbers and all that they were made from). A second run reuses
 what the first one made. docs/how-to/figures.md has the rest.
 """
 
-import json
+import argparse
 import math
+import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from benchmarks.quality.methods.method import Method, Task
-from benchmarks.quality.panel_data import (
-    FOV_DEG,
-    YAWS,
-    Size,
-    Some,
-    answered,
-    geometry_at,
-    like,
-    options_of,
-    paths_at,
-    positions_of,
-    scene,
-    show,
-    small_png,
-    table_text,
-    training_spectra,
-    window_for,
-)
-from rf3dgs.channel.arrays import PlanarArray, planar_array
-from rf3dgs.channel.io import PathsReader
+from benchmarks.quality.methods.method import Method, Scale, Task
+from benchmarks.quality.panel_data import answered, held_out, like, show, small_png, turned
+from benchmarks.quality.protocol.figure import made_by, page_or_sentence, parser_of, rows_of, study_of, write_json
+from benchmarks.quality.protocol.pictures import YAWS_DEG
+from benchmarks.quality.protocol.study import Study, say
+from rf3dgs.channel.arrays import PlanarArray
 from rf3dgs.channel.paths import Paths
-from rf3dgs.core.errors import MissingDependencyError
+from rf3dgs.core.errors import MissingDependencyError, RfError
 from rf3dgs.core.files import write_whole
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import Camera, DirectionGrid, pinhole_grid
+from rf3dgs.core.grids import Camera, DirectionGrid
 from rf3dgs.core.units import db_from_power
 from rf3dgs.evaluation import metrics
 from rf3dgs.evaluation.baselines.lookup import NearestNeighbour
@@ -51,24 +37,22 @@ from rf3dgs.evaluation.protocol import Predictor
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.field.waves import seen_by_array
 from rf3dgs.propagation.config import PhotoConfig
+from rf3dgs.propagation.sites.scene import Scene
 from rf3dgs.spectra.codec import DbWindow
-from rf3dgs.spectra.scan import spectrum_of
-from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
+from rf3dgs.spectra.config import Method as SpectrumMethod
+from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.spectra.synthesis import default_lobe
-from rf3dgs.spectra.yaws import at_yaws
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.training.config import RadioConfig
 from rf3dgs.training.photographs import render_photo
 from rf3dgs.training.radio import fit_radio
 
-SIZES = {
-    "smoke": (Size(16, 20_000, 6), (36, 24), (72, 48)),
-    "laptop": (Size(120, 300_000, 40), (75, 50), (300, 200)),
-    "paper": (Size(800, 300_000, 640), (300, 200), (300, 200)),
-}
-"""What is traced and learned, the pixels of a training picture, and those of a panel."""
+TRAINING: Mapping[Scale, int] = {"smoke": 6, "laptop": 40, "paper": 160}
+"""Training positions."""
+SHOWN: Mapping[Scale, tuple[int, int]] = {"smoke": (72, 48), "laptop": (300, 200), "paper": (300, 200)}
+"""Columns and rows of a panel."""
 PAPER_STEPS = {"smoke": 20, "laptop": 1000, "paper": 10_000}
-GROUPS = {"ideal": "(b) ideal", "capon": "(c) MVDR, 8x8 patch"}
+GROUPS: Mapping[SpectrumMethod, str] = {"ideal": "(b) ideal", "capon": "(c) MVDR, 8x8 patch"}
 
 
 @dataclass(frozen=True)
@@ -128,17 +112,13 @@ class Group:
     window: DbWindow
 
 
-def pictures_of(group: str, size: tuple[int, int], lobe: float) -> Callable[[Paths, int], Spectrum]:
-    """What makes the pictures `[yaw, row, col]` of one receiver that turns to every one of `YAWS`."""
-    grid, array = pinhole_grid(*size, FOV_DEG), planar_array(8, 8, "patch")
-
-    def pictures(paths: Paths, seed: int) -> Spectrum:
-        turned = at_yaws(paths, YAWS)
-        if group == "ideal":
-            return spectrum_of(turned, None, grid, lobe=lobe)
-        return spectrum_of(turned, array, grid, method="capon", seed=seed)
-
-    return pictures
+def truth_of(study: Study, number: int, paths: Paths, yaw: int, shown: tuple[int, int]) -> Spectrum:
+    """What receiver `number` sees `[1, row, col]` in one of its views, as the study's pictures but in more pixels."""
+    seen = study.config.pictures
+    finer = replace(seen, size=shown, yaws_deg=seen.yaws_deg[yaw : yaw + 1])
+    if seen.method == "ideal":
+        return turned(paths, math.radians(finer.yaws_deg[0]), finer.grid, default_lobe(seen.grid))
+    return finer.of(number, paths)
 
 
 def scores(truth: Spectrum, answer: Spectrum, window: DbWindow) -> dict[str, float]:
@@ -153,14 +133,14 @@ def scores(truth: Spectrum, answer: Spectrum, window: DbWindow) -> dict[str, flo
     }
 
 
-def photograph(kind: str, pose: Pose, grid: DirectionGrid, geometry: Gaussians) -> tuple[np.ndarray, str]:
+def photograph(kind: str, site: Scene, pose: Pose, grid: DirectionGrid, geometry: Gaussians) -> tuple[np.ndarray, str]:
     """The twin's photograph uint8 `[row, col, 3]` at a pinhole, and what it is; without Mitsuba, the Gaussians'."""
     camera = Camera.of(pose, grid)
     if kind != "gaussians":
         try:
             from rf3dgs.propagation.photographer import render_photos
 
-            return next(render_photos(scene(), [camera], PhotoConfig())), "(a) digital twin"
+            return next(render_photos(site, [camera], PhotoConfig())), "(a) digital twin"
         except MissingDependencyError:
             if kind == "twin":
                 raise
@@ -215,72 +195,74 @@ def _mark(axis, true: tuple[float, float] | None, found: tuple[float, float] | N
         axis.annotate("", found, true, arrowprops={"arrowstyle": "->", "color": "#e53935", "linewidth": 1.0})
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Make the figure; returns 0."""
-
-    def extra(parser) -> None:
-        parser.add_argument("--view", type=int, default=0, help="which of the validation positions is shown")
-        parser.add_argument("--photo", choices=("auto", "twin", "gaussians"), default="auto", help="what (a) is")
-
-    options = options_of("fig1", extra, words, __doc__)
-    out: Path = options.out
-    out.mkdir(parents=True, exist_ok=True)
-    started = time.process_time()
-    size, small, shown = SIZES[options.scale]
-    lobe, grid = default_lobe(pinhole_grid(*small, FOV_DEG)), pinhole_grid(*shown, FOV_DEG)
-    geometry = geometry_at(options.geometry, out, options.scale)
-    with PathsReader(paths_at(options.paths, out, size)) as reader:
-        training, judged = positions_of(reader, options.training or size.training, options.seed)
-        number = judged[options.view % len(judged)]
-        views = {group: pictures_of(group, shown, lobe)(reader[number], 4 * number) for group in GROUPS}
-        yaw = int(views["ideal"].power.amax((-2, -1)).argmax())
-        pose = views["ideal"].pose[yaw]
-        groups = []
-        for group, title in GROUPS.items():
-            settings = {"group": group, "size": list(small), "lobe": lobe}
-            folder = out / f"{group}-{options.scale}-{options.seed}-{len(training)}"
-            spectra = training_spectra(Some(reader, training), pictures_of(group, small, lobe), folder, settings)
-            task = Task(spectra, window_for(spectra), options.seed, options.scale, geometry)
-            truth = stack_spectra([views[group][yaw]])
-            answers = {
-                method.name: like(
-                    truth,
-                    answered(method, task, truth.pose, grid, out, lambda method=method, task=task: method.made(task)),
-                )
-                for method in COLUMNS
-            }
-            groups.append(Group(title, truth, answers, task.window))
-    write_whole(out / "fig1.png", draw(photograph(options.photo, pose, grid, geometry), groups))
-    found = {
-        group.title: {name: scores(group.truth, answer, group.window) for name, answer in group.answers.items()}
-        for group in groups
-    }
-    facts = {
-        "scale": options.scale,
-        "seed": options.seed,
-        "training": training,
-        "view": number,
-        "yaw_deg": math.degrees(YAWS[yaw]),
-        "position": pose.position.tolist(),
-        "lobe_deg": math.degrees(lobe),
+def made(wish: argparse.Namespace) -> tuple[bytes, dict[str, Any]]:
+    """The figure as PNG bytes, and its numbers."""
+    studies = {group: study_of(wish, "fig1", method=group, holdouts=("random",)) for group in GROUPS}
+    ideal, count = studies["ideal"], wish.training or TRAINING[wish.scale]
+    numbers, paths, spectra = held_out(ideal, ideal.config.judged)
+    place = wish.view % len(numbers)
+    yaw = int(spectra.power[place * ideal.data.views :][: ideal.data.views].amax((-2, -1)).argmax())
+    groups = []
+    for group, study in studies.items():
+        task = study.task(count, wish.seed)
+        truth = truth_of(study, numbers[place], paths[place], yaw, SHOWN[wish.scale])
+        answers = {}
+        for method in COLUMNS:
+            say(f"{group}: {method.name}")
+            power = answered(method, task, truth.pose, truth.grid, study.config.out, lambda m=method, t=task: m.made(t))
+            answers[method.name] = like(truth, power)
+        groups.append(Group(GROUPS[group], truth, answers, task.window))
+    first = groups[0].truth
+    photo = photograph(wish.photo, ideal.scene, first.pose[0], first.grid, ideal.geometry)
+    return draw(photo, groups), {
+        "scale": wish.scale,
+        "seed": wish.seed,
+        "training": ideal.data.split.training(count, wish.seed).tolist(),
+        "view": numbers[place],
+        "yaw_deg": YAWS_DEG[yaw],
+        "position": first.pose.position[0].tolist(),
+        "lobe_deg": math.degrees(default_lobe(ideal.config.pictures.grid)),
         "windows": {group.title: [group.window.floor_db, group.window.ceil_db] for group in groups},
         "true peak [dB]": {group.title: float(db_from_power(group.truth.power.amax())) for group in groups},
-        "scores": found,
+        "scores": {
+            group.title: {name: scores(group.truth, answer, group.window) for name, answer in group.answers.items()}
+            for group in groups
+        },
     }
-    write_whole(out / "fig1.json", (json.dumps(facts, indent=1) + "\n").encode())
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Make the figure; the exit status."""
+    parser = parser_of(__doc__, "fig1")
+    parser.add_argument("--training", type=int, help="training positions; the scale's number when missing")
+    parser.add_argument("--view", type=int, default=0, help="which of the held-out positions is shown")
+    parser.add_argument("--photo", choices=("auto", "twin", "gaussians"), default="auto", help="what (a) is")
+    parser.add_argument("--seed", type=int, default=0, help="of the training positions and the fits")
+    wish, started = parser.parse_args(words), time.process_time()
+    try:
+        picture, facts = made(wish)
+    except RfError as error:
+        say(f"fig1: {error}")
+        return 2
     rows = [
         [title, name, f"{s['psnr_db']:.2f}", f"{s['ssim']:.3f}", f"{s['rmse_db']:.2f}", f"{s['peak_deg']:.2f}"]
-        for title, column in found.items()
+        for title, column in facts["scores"].items()
         for name, s in column.items()
     ]
-    text = table_text(("group", "column", "PSNR [dB]", "SSIM", "RMSE [dB]", "main peak [deg]"), rows)
-    write_whole(out / "fig1.md", (text + "\n").encode())
+    place = ", ".join(f"{value:.2f}" for value in facts["position"])
+    parts = [
+        rows_of(("group", "column", "PSNR [dB]", "SSIM", "RMSE [dB]", "main peak [deg]"), rows),
+        f"{len(facts['training'])} training positions; receiver {facts['view']} at ({place}), yaw "
+        f"{facts['yaw_deg']:.0f} degrees; {time.process_time() - started:.0f} s of CPU time.",
+        made_by("fig1", [wish.seed], words),
+    ]
+    text, name = "\n\n".join(parts), f"fig1-{wish.scale}"
+    write_whole((wish.pictures or wish.out) / f"{name}.png", picture)
+    write_json(wish.out / f"{name}.json", facts)
+    write_whole(wish.out / f"{name}.md", (text + "\n").encode())
     print(text)
-    place = ", ".join(f"{value:.2f}" for value in pose.position.tolist())
-    print(f"{len(training)} training positions; receiver {number} at ({place}), yaw {math.degrees(YAWS[yaw]):.0f} deg")
-    print(f"{out / 'fig1.png'}; {time.process_time() - started:.0f} s of CPU")
-    return 0
+    return page_or_sentence(wish.page, "fig1", text)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

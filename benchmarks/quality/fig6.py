@@ -1,76 +1,66 @@
 """The paper's Fig. 6: does a field show more than the spectra that it has learned from?
 
-    python -m benchmarks.quality.fig6 --scale smoke|laptop|paper --out out/fig6
+    python -m benchmarks.quality.fig6 --scale laptop --paths paper.paths
 
 At held-out poses, on one pinhole, everything is compared with a finer truth: three times the rays, another lattice and
-seed, and a lobe of 1 degree. One candidate is the spectrum of training quality at that very pose, which no method ever
+seed, and a narrower lobe. One candidate is the spectrum of training quality at that very pose, which no method ever
 saw. Whoever is nearer to the finer truth shows more. The finer truth is solved twice, so that its own noise, which is
-large in so narrow a lobe, is known and taken off. Writes fig6.png, fig6.md and fig6.json; a second run reuses what
-the first one made. docs/how-to/figures.md has the rest.
+large in so narrow a lobe, is known and taken off. Writes fig6-SCALE.png, .md and .json; a second run reuses what the
+first one made. docs/how-to/figures.md has the rest.
 """
 
-import json
+import argparse
 import math
+import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.quality.fig1 import COLUMNS, OURS
+from benchmarks.quality.fig1 import COLUMNS, OURS, TRAINING
 from benchmarks.quality.fig6_scores import COLUMNS as SCORES
 from benchmarks.quality.fig6_scores import blur_of, detail_of, interval, scores, truth_of, verdict
-from benchmarks.quality.methods.method import Task
+from benchmarks.quality.methods.method import Scale
 from benchmarks.quality.panel_data import (
-    FOV_DEG,
-    SAME_PLACE,
-    YAWS,
-    Size,
-    Some,
     answered,
-    geometry_at,
+    held_out,
     identity_of,
     kept,
-    options_of,
-    paths_at,
-    positions_of,
     rendered,
-    scene,
     show,
     small_png,
-    table_text,
-    training_spectra,
-    window_for,
+    turned,
 )
+from benchmarks.quality.protocol.data import window_for
+from benchmarks.quality.protocol.figure import made_by, page_or_sentence, parser_of, rows_of, study_of, write_json
+from benchmarks.quality.protocol.pictures import YAWS_DEG, pinholes
+from benchmarks.quality.protocol.study import Study, say
 from rf3dgs.channel.io import PathsReader
 from rf3dgs.channel.paths import Paths
-from rf3dgs.core.errors import InputError
+from rf3dgs.core.errors import InputError, RfError
 from rf3dgs.core.files import write_whole
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import DirectionGrid, equirect_grid, pinhole_grid
+from rf3dgs.core.grids import DirectionGrid
 from rf3dgs.evaluation import metrics
 from rf3dgs.evaluation.figures import STYLE
 from rf3dgs.evaluation.pictures import colour_range, coloured
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.propagation.config import TraceConfig
 from rf3dgs.spectra.codec import DbWindow
-from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Instrument, Spectrum, stack_spectra
 from rf3dgs.spectra.synthesis import default_lobe
-from rf3dgs.spectra.yaws import at_yaws
 
 
 @dataclass(frozen=True)
 class Fineness:
-    """What a scale learns from, and what it is judged on."""
+    """What a scale is judged on."""
 
-    size: Size
-    sphere: tuple[int, int] | None
-    """Pixels of the training spheres; None for the paper's four pinholes of 300x200 a position."""
     shown: tuple[int, int]
     """Pixels of the pinhole that everything is judged on."""
     lobe_deg: float
@@ -79,14 +69,15 @@ class Fineness:
     """Held-out positions."""
 
 
-SCALES = {
-    "smoke": Fineness(Size(16, 20_000, 6), (72, 36), (72, 48), 2.5, 2),
-    "laptop": Fineness(Size(120, 300_000, 40), (180, 90), (300, 200), 1.0, 8),
-    "paper": Fineness(Size(800, 300_000, 640), None, (300, 200), 1.0, 80),
+SCALES: Mapping[Scale, Fineness] = {
+    "smoke": Fineness((72, 48), 2.5, 2),
+    "laptop": Fineness((300, 200), 1.0, 8),
+    "paper": Fineness((300, 200), 1.0, 40),
 }
 FINER = 3  # times the rays
 AGAIN = 7919  # more rays for the second solve of the finer truth: another lattice
 SEED = 200_003  # of the finer truth, away from those of the paths
+SAME_PLACE = 1e-3  # m
 COARSE, SHARP = "training quality at that pose", "our field, points in the fine lobe"
 
 
@@ -109,9 +100,9 @@ class Sharper:
         return replace(whole, power=surface + points * (self.field.instrument.beam_solid_angle / fine.beam_solid_angle))
 
 
-def finer_paths(given: Path | None, reader: PathsReader, number: int, again: bool, size: Size) -> Paths:
-    """Paths `[path]` of the finer truth at a receiver: traced anew, or those that stand there among the given ones."""
-    here = reader.rx[number : number + 1]
+def finer_paths(study: Study, given: Path | None, number: int, paths: Paths, again: bool) -> Paths:
+    """Paths `[path]` of the finer truth where `paths` end: traced anew, or those that stand there among the given."""
+    here = Pose(paths.rx.position[None], paths.rx.orientation[None])
     if given is not None:
         with PathsReader(given) as finer:
             apart = torch.linalg.vector_norm(finer.rx.position - here.position, dim=-1)
@@ -120,22 +111,43 @@ def finer_paths(given: Path | None, reader: PathsReader, number: int, again: boo
             return finer[int(apart.argmin())]
     from rf3dgs.propagation.sionna import trace_each
 
-    config = TraceConfig(rays=FINER * size.rays + AGAIN * again, seed=SEED + 1000 * SEED * again)
-    return next(trace_each(scene(), None, here, config, indices=[number]))[0]
+    config = TraceConfig(rays=finer_rays(study) + AGAIN * again, seed=SEED + 1000 * SEED * again)
+    return next(trace_each(study.scene, None, here, config, indices=[number]))[0]
 
 
-def turned(paths: Paths, yaw: float, grid: DirectionGrid, lobe: float) -> Spectrum:
-    """The ideal spectrum `[1, row, col]` of a receiver that turned by `yaw` [rad]."""
-    return spectrum_of(at_yaws(paths, [yaw]), None, grid, lobe=lobe)
+def finer_rays(study: Study) -> int:
+    """Rays of the finer truth."""
+    return FINER * (study.config.rays or TraceConfig().rays)
 
 
-def training_pictures(how: Fineness) -> tuple[Callable[[Paths, int], Spectrum], float]:
-    """What makes the training pictures of one receiver, and their lobe [rad]."""
-    grid = pinhole_grid(300, 200, FOV_DEG) if how.sphere is None else equirect_grid(*how.sphere)
-    lobe = default_lobe(grid)
-    if how.sphere is None:
-        return lambda paths, seed: spectrum_of(at_yaws(paths, YAWS), None, grid, lobe=lobe), lobe
-    return lambda paths, seed: spectrum_of(paths, None, grid, lobe=lobe), lobe
+def finer_truth(
+    study: Study, given: Path | None, numbers: Sequence[int], paths: Sequence[Paths], again: bool
+) -> Tensor:
+    """Powers `[n, row, col]` of the finer truth at each receiver, in its own lobe; kept one by one."""
+    how = SCALES[study.config.scale]
+    grid, lobe = pinholes(*how.shown).grid, math.radians(how.lobe_deg)
+    rows = []
+    for number, one, yaw in zip(numbers, paths, yaws_of(numbers), strict=True):
+        identity = {
+            "paths": str(given or "traced"),
+            "at": one.rx.position.tolist(),
+            "yaw": yaw,
+            "lobe": lobe,
+            "grid": list(how.shown),
+            "rays": finer_rays(study),
+        }
+
+        def solved(number=number, one=one, yaw=yaw) -> Tensor:
+            return turned(finer_paths(study, given, number, one, again), yaw, grid, lobe).power
+
+        name = "finer truth again" if again else "finer truth"
+        rows.append(kept(study.config.out / "kept", name, identity, solved))
+    return torch.cat(rows)
+
+
+def yaws_of(numbers: Sequence[int]) -> list[float]:
+    """Where each of some receivers looks [rad]: along the four yaws in turn."""
+    return [math.radians(YAWS_DEG[place % len(YAWS_DEG)]) for place in range(len(numbers))]
 
 
 def draw(solves: tuple[Tensor, Tensor], answers: Mapping[str, Tensor], window: DbWindow, sigma: float) -> bytes:
@@ -164,71 +176,30 @@ def draw(solves: tuple[Tensor, Tensor], answers: Mapping[str, Tensor], window: D
         return small_png(figure)
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Make the figure; returns 0."""
-
-    def extra(parser) -> None:
-        parser.add_argument("--truth", type=Path, help="paths of the finer truth; traced unless given")
-        parser.add_argument("--judged", type=int, help="held-out positions; the scale's number unless given")
-        parser.add_argument("--view", type=int, default=0, help="which of them is drawn")
-
-    options = options_of("fig6", extra, words, __doc__)
-    out: Path = options.out
-    out.mkdir(parents=True, exist_ok=True)
-    started, how = time.process_time(), SCALES[options.scale]
-    fine, grid = math.radians(how.lobe_deg), pinhole_grid(*how.shown, FOV_DEG)
-    pictures_of, lobe = training_pictures(how)
+def made(wish: argparse.Namespace) -> tuple[bytes, dict[str, Any], str]:
+    """The figure as PNG bytes, its numbers, and the table."""
+    how, study = SCALES[wish.scale], study_of(wish, "fig6", holdouts=("random",))
+    grid, fine = pinholes(*how.shown).grid, math.radians(how.lobe_deg)
+    lobe = default_lobe(study.config.pictures.grid)
     rise = Instrument.gaussian(lobe).beam_solid_angle / Instrument.gaussian(fine).beam_solid_angle
-    geometry = geometry_at(options.geometry, out, options.scale)
-    with PathsReader(paths_at(options.paths, out, how.size)) as reader:
-        training, judged = positions_of(reader, options.training or how.size.training, options.seed)
-        judged = judged[: options.judged or how.judged]
-        settings = {"sphere": how.sphere and list(how.sphere), "lobe": lobe}
-        folder = out / f"spectra-{options.scale}-{options.seed}-{len(training)}"
-        spectra = training_spectra(Some(reader, training), pictures_of, folder, settings)
-        yaws = [YAWS[place % len(YAWS)] for place in range(len(judged))]
-        coarse = stack_spectra(
-            [turned(reader[number], yaw, grid, lobe) for number, yaw in zip(judged, yaws, strict=True)]
-        )
-
-        def finer(again: bool) -> Tensor:
-            """Powers `[n, row, col]` of the finer truth, in levels of the training lobe; kept one by one."""
-            rows = []
-            for number, yaw in zip(judged, yaws, strict=True):
-                identity = {
-                    "paths": str(options.truth or "traced"),
-                    "at": reader.rx.position[number].tolist(),
-                    "yaw": yaw,
-                    "lobe": fine,
-                    "grid": list(how.shown),
-                    "rays": FINER * how.size.rays,
-                }
-                rows.append(
-                    kept(
-                        out / "kept",
-                        "finer truth again" if again else "finer truth",
-                        identity,
-                        lambda number=number, yaw=yaw: (
-                            turned(finer_paths(options.truth, reader, number, again, how.size), yaw, grid, fine).power
-                        ),
-                    )
-                )
-            return torch.cat(rows) * rise
-
-        solves = finer(again=False), finer(again=True)
-    truth = (solves[0] + solves[1]) / 2
-    task = Task(spectra, window_for(spectra), options.seed, options.scale, geometry)
+    count, folder = wish.training or TRAINING[wish.scale], study.config.out
+    numbers, paths, _ = held_out(study, wish.judged or how.judged)
+    task = study.task(count, wish.seed)
+    coarse = stack_spectra([turned(one, yaw, grid, lobe) for one, yaw in zip(paths, yaws_of(numbers), strict=True)])
+    first, second = (finer_truth(study, wish.truth, numbers, paths, again) * rise for again in (False, True))
+    solves, truth = (first, second), (first + second) / 2
     answers = {COARSE: coarse.power}
     for method in COLUMNS:
+        say(method.name)
         trained = cache(lambda method=method: method.made(task))
-        answers[method.name] = answered(method, task, coarse.pose, grid, out, trained)
+        answers[method.name] = answered(method, task, coarse.pose, grid, folder, trained)
         if method is OURS:
             identity = identity_of(task, coarse.pose, grid) | {"settings": dict(OURS.settings(task)), "lobe": fine}
 
             def sharper(trained=trained) -> Tensor:
                 return rendered(Sharper(trained(), fine), coarse.pose, grid)
 
-            answers[SHARP] = kept(out / "kept", SHARP, identity, sharper)
+            answers[SHARP] = kept(folder / "kept", SHARP, identity, sharper)
     window = window_for(replace(coarse, power=truth))
     found = {name: scores(solves, power, grid, window, lobe) for name, power in answers.items()}
     against = {
@@ -236,35 +207,58 @@ def main(words: Sequence[str] | None = None) -> int:
         for name, values in found.items()
         if name != COARSE
     }
-    view = options.view % len(judged)
-    shown = {name: power[view] for name, power in answers.items()}
+    view = wish.view % len(numbers)
     colours = colour_range([replace(coarse[view], power=truth[view])])
-    picture = draw((solves[0][view], solves[1][view]), shown, colours, blur_of(grid, lobe))
-    write_whole(out / "fig6.png", picture)
-    facts = {
-        "scale": options.scale,
-        "seed": options.seed,
-        "training": training,
-        "judged": judged,
-        "lobe_deg": {"training": math.degrees(lobe), "truth": how.lobe_deg},
-        "window": [window.floor_db, window.ceil_db],
-        "finer truth": truth_of(solves, grid, window, lobe),
-        "scores": {
-            name: {score: values.tolist() for score, values in column.items()} for name, column in found.items()
-        },
-        "against training quality": against,
-    }
-    write_whole(out / "fig6.json", (json.dumps(facts, indent=1) + "\n").encode())
+    shown = {name: power[view] for name, power in answers.items()}
+    picture = draw((first[view], second[view]), shown, colours, blur_of(grid, lobe))
     true = truth_of(solves, grid, window, lobe)
     said = (
         f"The finer truth has {true['detail']:.2f} dB of detail (RMS), a sharpness of {true['sharpness']:.2f} dB/pixel "
         f"and {true['noise']:.2f} dB of noise, which is taken off, but not from SSIM."
     )
-    text = f"{_table(found, against)}\n\n{said}"
-    write_whole(out / "fig6.md", (text + "\n").encode())
+    facts = {
+        "scale": wish.scale,
+        "seed": wish.seed,
+        "training": study.data.split.training(count, wish.seed).tolist(),
+        "judged": numbers,
+        "lobe_deg": {"training": math.degrees(lobe), "truth": how.lobe_deg},
+        "window": [window.floor_db, window.ceil_db],
+        "finer truth": true,
+        "scores": {
+            name: {score: values.tolist() for score, values in column.items()} for name, column in found.items()
+        },
+        "against training quality": against,
+    }
+    return picture, facts, f"{_table(found, against)}\n\n{said}"
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Make the figure; the exit status."""
+    parser = parser_of(__doc__, "fig6")
+    parser.add_argument("--training", type=int, help="training positions; the scale's number when missing")
+    parser.add_argument("--truth", type=Path, help="paths of the finer truth; traced when missing")
+    parser.add_argument("--judged", type=int, help="held-out positions; the scale's number when missing")
+    parser.add_argument("--view", type=int, default=0, help="which of them is drawn")
+    parser.add_argument("--seed", type=int, default=0, help="of the training positions and the fits")
+    wish, started = parser.parse_args(words), time.process_time()
+    try:
+        picture, facts, table = made(wish)
+    except RfError as error:
+        say(f"fig6: {error}")
+        return 2
+    counts = f"{len(facts['training'])} training positions, {len(facts['judged'])} judged"
+    parts = [
+        table,
+        f"{counts}; lobe {facts['lobe_deg']['training']:.1f} degrees, of the finer truth "
+        f"{facts['lobe_deg']['truth']:g}; {time.process_time() - started:.0f} s of CPU time.",
+        made_by("fig6", [wish.seed], words),
+    ]
+    text, name = "\n\n".join(parts), f"fig6-{wish.scale}"
+    write_whole((wish.pictures or wish.out) / f"{name}.png", picture)
+    write_json(wish.out / f"{name}.json", facts)
+    write_whole(wish.out / f"{name}.md", (text + "\n").encode())
     print(text)
-    print(f"{len(training)} training positions, {len(judged)} judged; {time.process_time() - started:.0f} s of CPU")
-    return 0
+    return page_or_sentence(wish.page, "fig6", text)
 
 
 def _table(found: Mapping[str, Mapping[str, np.ndarray]], against: Mapping[str, Mapping[str, str]]) -> str:
@@ -277,8 +271,8 @@ def _table(found: Mapping[str, Mapping[str, np.ndarray]], against: Mapping[str, 
             said = f" ({against[name][score]})" if score in against.get(name, {}) else ""
             row.append(f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]{said}")
         rows.append(row)
-    return table_text(("against the finer truth", *(label for label, _ in SCORES.values())), rows)
+    return rows_of(("against the finer truth", *(label for label, _ in SCORES.values())), rows)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

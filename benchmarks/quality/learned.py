@@ -1,12 +1,11 @@
 """Does a learned baseline learn? One view by heart, other positions better than a constant, and what it costs.
 
-    python -m benchmarks.quality.learned --method nerf2-db --scale laptop --paths lobby.paths --out build/learned
+    python -m benchmarks.quality.learned --method nerf2-db --scale laptop --paths paper.paths
 
-`--paths` is what `rf3dgs trace lobby --preset paper` wrote; without it an exact room with smooth walls is taken. The
-method is fitted twice: to one picture, and to four pictures (yaw 0, 90, 180, 270 degrees) at each of `--positions`
-places; `--held` other places judge. Traced places are split as in the radiance table: those that judge are of its
-random validation part, and its sealed ones are not looked at. Writes NAME.json (all figures) and NAME.png (both
-training curves, and a held-out picture beside its prediction).
+`--paths` is what `rf3dgs trace lobby --preset paper` wrote, split and pictured as in the figures; without it an exact
+room with smooth walls is taken. The method is fitted twice: to one picture, and to four pictures (yaw 0, 90, 180, 270
+degrees) at each of `--positions` places; the first `--held` of the held-out places judge. Writes NAME.json (all
+figures) and NAME.png (both training curves, and a held-out picture beside its prediction).
 
 Works with every method whose predictor has `history`: entries of iterations done, wall seconds, mean loss and, where it
 has one, a held-out score. A method's file may have `published_cost(task)`, the cost at the published size, which is
@@ -16,24 +15,29 @@ extrapolated from what is measured here and called so.
 import argparse
 import importlib
 import io
-import json
-import math
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import torch
 
-from benchmarks.quality.methods.method import SCALES, Method, Scale, Task
-from benchmarks.quality.protocol.split import split_of
-from rf3dgs.channel.io import PathsReader
+from benchmarks.quality.methods.method import Method, Scale, Task
+from benchmarks.quality.protocol.figure import (
+    SIZES,
+    made_by,
+    page_or_sentence,
+    parser_of,
+    study_of,
+    write_json,
+)
+from benchmarks.quality.protocol.pictures import pinholes
+from benchmarks.quality.protocol.study import say
 from rf3dgs.channel.paths import Paths
 from rf3dgs.core.errors import InputError, RfError
 from rf3dgs.core.files import write_whole
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import pinhole_grid
 from rf3dgs.evaluation import metrics
 from rf3dgs.evaluation.baselines.lookup import NearestNeighbour
 from rf3dgs.evaluation.figures import STYLE
@@ -41,13 +45,9 @@ from rf3dgs.evaluation.pictures import coloured
 from rf3dgs.evaluation.protocol import Predictor, refuse_leak
 from rf3dgs.propagation.room import shoebox
 from rf3dgs.spectra.codec import DbWindow, PerViewLinear, window_of
-from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
-from rf3dgs.spectra.yaws import at_yaws
 
 SUBJECTS = {"nerf2": "nerf2", "nerf2-db": "nerf2", "cgan": "cgan"}  # the file of each method
-SIZES = {"smoke": (36, 24), "laptop": (75, 50), "paper": (300, 200)}
-YAWS = tuple(math.radians(yaw) for yaw in (0.0, 90.0, 180.0, 270.0))
 ROOM, TX = (6.0, 5.0, 3.0), (0.6, 0.8, 2.6)
 BY_HEART_DB = 30.0
 
@@ -58,10 +58,10 @@ def method_of(name: str) -> tuple[Method, Any]:
     return next(method for method in file.METHODS if method.name == name), file
 
 
-def pictures(paths: Iterable[Paths], scale: str) -> Spectrum:
+def pictures(paths: Iterable[Paths], scale: Scale) -> Spectrum:
     """Ideal pinhole pictures `[4 n, row, col]` of the paths to n receivers, four at each."""
-    grid = pinhole_grid(*SIZES[scale], 90.0)
-    return stack_spectra([spectrum_of(at_yaws(one, YAWS), None, grid, method="ideal") for one in paths])
+    seen = pinholes(*SIZES[scale].picture)
+    return stack_spectra([seen.of(number, one) for number, one in enumerate(paths)])
 
 
 def room_paths(count: int, seed: int) -> Iterator[Paths]:
@@ -71,21 +71,20 @@ def room_paths(count: int, seed: int) -> Iterator[Paths]:
     return (paths[index] for index in range(count))
 
 
-def data(wish: argparse.Namespace) -> tuple[Spectrum, Spectrum]:
-    """Training and judging pictures at the wished numbers of places; of traced paths none of a sealed place."""
+def data(wish: argparse.Namespace) -> tuple[Task, Spectrum]:
+    """What is learned from, and the pictures that judge, at the wished numbers of places."""
+    if min(wish.positions, wish.held) < 1:
+        raise InputError(f"--positions and --held must be at least 1; got {wish.positions} and {wish.held}")
     if wish.paths is None:
         paths = list(room_paths(wish.positions + wish.held, wish.seed))
-        return pictures(paths[: wish.positions], wish.scale), pictures(paths[wish.positions :], wish.scale)
-    with PathsReader(wish.paths) as reader:
-        count = len(reader) if wish.receivers is None else min(wish.receivers, len(reader))
-        split = split_of(torch.stack([reader[index].rx.position for index in range(count)]))
-        judges = split.part("validation", "random")
-        if len(judges) < wish.held:
-            raise InputError(f"{len(judges)} places are for validation and {wish.held} are asked; lower --held")
-        train = split.training(wish.positions, wish.seed)
-        parts = ((reader[int(index)] for index in chosen) for chosen in (train, judges[: wish.held]))
-        first, second = (pictures(part, wish.scale) for part in parts)
-        return first, second
+        train, judge = (pictures(part, wish.scale) for part in (paths[: wish.positions], paths[wish.positions :]))
+        return Task(train, window_of(train), wish.seed, wish.scale), judge
+    study = study_of(wish, "learned", holdouts=("random",))
+    judge = study.truth("random").spectra
+    there = len(judge) // study.data.views
+    if wish.held > there:
+        raise InputError(f"{there} places are held out and {wish.held} are asked; lower --held")
+    return study.task(wish.positions, wish.seed, geometry=False), judge[: wish.held * study.data.views]
 
 
 def scores(predictor: Predictor, truth: Spectrum, window: DbWindow) -> dict[str, float]:
@@ -117,14 +116,13 @@ def fitted(method: Method, task: Task) -> tuple[Any, float, float]:
     return predictor, time.perf_counter() - wall, time.process_time() - cpu
 
 
-def learned(name: str, train: Spectrum, judge: Spectrum, scale: Scale, seed: int) -> tuple[dict, bytes]:
+def learned(name: str, task: Task, judge: Spectrum) -> tuple[dict, bytes]:
     """All figures of one method, and its picture as PNG bytes."""
     method, file = method_of(name)
+    train, window = task.spectra, task.window
     refuse_leak(train.pose.position, judge.pose.position)
-    window = window_of(train)
     alone = train[:1]
-    one, *_ = fitted(method, Task(alone, window, seed, scale))
-    task = Task(train, window, seed, scale)
+    one, *_ = fitted(method, replace(task, spectra=alone))
     many, wall, cpu = fitted(method, task)
     began = time.process_time()
     held_out = scores(many, judge, window)
@@ -132,9 +130,9 @@ def learned(name: str, train: Spectrum, judge: Spectrum, scale: Scale, seed: int
     cost = getattr(file, "published_cost", None)
     figures = {
         "method": name,
-        "scale": scale,
-        "places": [len(train) // len(YAWS), len(judge) // len(YAWS)],
-        "seed": seed,
+        "scale": task.scale,
+        "places": [len(torch.unique(part.pose.position, dim=0)) for part in (train, judge)],
+        "seed": task.seed,
         "settings": dict(method.settings(task)),
         "one_view": scores(one, alone, window),
         "held_out": {
@@ -207,33 +205,31 @@ def lines_of(figures: dict) -> list[str]:
     return lines
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    assert __doc__ is not None
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def asked(words: Sequence[str] | None = None) -> argparse.Namespace:
+    parser = parser_of(__doc__, "learned", without="an exact room")
     parser.add_argument("--method", nargs="+", choices=sorted(SUBJECTS), required=True, help="what is to learn")
-    parser.add_argument("--scale", choices=SCALES, default="laptop", help="size of pictures and network")
-    parser.add_argument("--paths", type=Path, help="traced paths; an exact room unless given")
-    parser.add_argument("--receivers", type=int, help="take the first so many of the paths; all unless given")
     parser.add_argument("--positions", type=int, default=40, help="training places")
     parser.add_argument("--held", type=int, default=10, help="places that judge")
     parser.add_argument("--seed", type=int, default=0, help="of the places and of the method")
-    parser.add_argument("--out", type=Path, default=Path("build/learned"), help="folder of NAME.json and NAME.png")
-    wish = parser.parse_args(arguments)
+    return parser.parse_args(words)
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    wish, parts = asked(words), []
     try:
-        if min(wish.positions, wish.held) < 1:
-            raise InputError(f"--positions and --held must be at least 1; got {wish.positions} and {wish.held}")
-        train, judge = data(wish)
+        task, judge = data(wish)
         for name in wish.method:
-            figures, picture = learned(name, train, judge, wish.scale, wish.seed)
+            figures, picture = learned(name, task, judge)
             figures["data"] = "exact room" if wish.paths is None else wish.paths.name
-            wish.out.mkdir(parents=True, exist_ok=True)
-            write_whole(wish.out / f"{name}.json", json.dumps(figures, indent=1).encode())
-            write_whole(wish.out / f"{name}.png", picture)
-            print("\n".join(lines_of(figures)))
+            write_json(wish.out / f"{name}.json", figures)
+            write_whole((wish.pictures or wish.out) / f"{name}.png", picture)
+            parts.append("\n".join(lines_of(figures)))
     except RfError as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
+        say(f"learned: {error}")
+        return 2
+    text = "\n\n".join([*parts, made_by("learned", [wish.seed], words)])
+    print(text)
+    return page_or_sentence(wish.page, "learned", text)
 
 
 if __name__ == "__main__":

@@ -1,45 +1,39 @@
 """The published recipe and what its choices cost: jet colours, levels, and pictures each by its own range.
 
-    python -m benchmarks.quality.recipe --paths FOLDER --geometry FILE --scale laptop [--page PAGE]
+    python -m benchmarks.quality.recipe --scale laptop --paths paper.paths --steps 10000 --seeds 0 1
 
 docs/how-to/published-recipe.md says what is compared and has the table.
 """
 
 import argparse
-import json
-import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
 from benchmarks.quality.methods.copies import METHODS as COPIES
-from benchmarks.quality.methods.method import SCALES, Method, Scale, Task
+from benchmarks.quality.methods.method import Method, Scale, Task
 from benchmarks.quality.methods.published import STEPS, TARGETS
-from benchmarks.quality.recipe_data import pictures_of
+from benchmarks.quality.protocol.figure import made_by, page_or_sentence, parser_of, study_of, write_json
+from benchmarks.quality.protocol.study import Study, say
 from benchmarks.quality.recipe_table import page_of
-from rf3dgs.core.errors import InputError, RfError
+from rf3dgs.core.errors import RfError
 from rf3dgs.core.files import write_whole
-from rf3dgs.core.progress import Console
 from rf3dgs.evaluation import metrics
 from rf3dgs.evaluation.baselines.published import PublishedConfig, PublishedField, fit_published
 from rf3dgs.evaluation.colours import colour_psnr, colour_ssim, jet_gap_db
 from rf3dgs.evaluation.protocol import Predictor
-from rf3dgs.spectra.codec import DbWindow, window_of
+from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.jet import jet_picture
 from rf3dgs.spectra.spectrum import Spectrum, stack_spectra
-from rf3dgs.splats.ply import read_ply
 from rf3dgs.training.config import RadioConfig
 from rf3dgs.training.radio import fit_radio
 
-SIZES: dict[Scale, tuple[int, int]] = {"smoke": (36, 24), "laptop": (75, 50), "paper": (300, 200)}
-POSITIONS: dict[Scale, tuple[int, int]] = {"smoke": (6, 4), "laptop": (80, 40), "paper": (400, 40)}
-RANGE_DB = 80.0  # between the window's ends, as in the other tables
+POSITIONS: dict[Scale, int] = {"smoke": 6, "laptop": 80, "paper": 160}
 PRESET = "preset"
 FLOORS = {method.name: method for method in COPIES if method.name in ("constant", "nearest", "linear")}
 MODELS = (*TARGETS, PRESET, *FLOORS)
@@ -91,109 +85,55 @@ def values_of(predictor: Predictor, truth: Spectrum, window: DbWindow) -> Values
     return {name: value.double().numpy() for name, value in found.items()}
 
 
-def measured(wish: argparse.Namespace) -> dict[str, Any]:
+def measured(study: Study, wish: argparse.Namespace) -> dict[str, Any]:
     """All values of all models, positions and seeds."""
-    positions, held = POSITIONS[wish.scale]
-    positions = wish.positions or [positions]
-    progress = Console()
-    pool, truth = pictures_of(
-        wish.paths,
-        wish.out / f"data-{wish.scale}",
-        positions=max(positions),
-        held=wish.held or held,
-        size=SIZES[wish.scale],
-        progress=progress,
-    )
-    found = window_of(pool)
-    window = DbWindow(max(found.floor_db, found.ceil_db - RANGE_DB), found.ceil_db)
-    geometry, steps = read_ply(wish.geometry), wish.steps or STEPS[wish.scale]
-    order = torch.randperm(max(positions), generator=torch.Generator().manual_seed(0))
+    judged, geometry = study.truth("random"), study.geometry
+    steps = wish.steps or STEPS[study.config.scale]
     rows = []
-    for count in positions:
-        views = (4 * order[:count, None] + torch.arange(4)).flatten().sort().values
+    for count in wish.positions or [POSITIONS[study.config.scale]]:
         for seed in wish.seeds:
+            task = study.task(count, seed)
             for name in wish.models:
-                if name in FLOORS and seed != wish.seeds[0]:
-                    continue  # they have no seed
-                print(f"{name}, {count} positions, seed {seed}", file=sys.stderr, flush=True)
-                task = Task(pool[views], window, seed, wish.scale, geometry)
+                say(f"{name}, {count} positions, seed {seed}")
                 start = time.process_time()
                 predictor = method_of(name, steps).made(task)
                 fitted = time.process_time()
-                values = values_of(predictor, truth, window)
-                judged = time.process_time() - fitted
+                values = values_of(predictor, judged.spectra, judged.window)
+                spent = time.process_time() - fitted
                 row = {"model": name, "positions": count, "seed": seed, "fit_cpu_s": fitted - start}
-                rows.append(row | {"judging_cpu_s": judged, "values": {k: v.tolist() for k, v in values.items()}})
+                rows.append(row | {"judging_cpu_s": spent, "values": {k: v.tolist() for k, v in values.items()}})
     return {
         "rows": rows,
         "steps": steps,
-        "window_db": [window.floor_db, window.ceil_db],
-        "held": len(truth) // 4,
-        "size": list(SIZES[wish.scale]),
+        "window_db": [judged.window.floor_db, judged.window.ceil_db],
+        "judge": study.config.judge,
+        "held": len(judged.spectra) // judged.views,
+        "views": judged.views,
+        "size": list(study.config.pictures.size),
         "gaussians": len(geometry),
         "seeds": wish.seeds,
-        "jet_gap_db": jet_gap_db(window.encode(truth.power)),
+        "jet_gap_db": jet_gap_db(judged.window.encode(judged.spectra.power)),
     }
 
 
-def asked(words: Sequence[str] | None = None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--paths", type=Path, required=True, help="what rf3dgs trace wrote")
-    parser.add_argument("--geometry", type=Path, required=True, help="Gaussians of the site, a .ply file")
-    parser.add_argument("--scale", choices=SCALES, default="laptop", help="pictures of 36x24, 75x50 or 300x200")
+def main(words: Sequence[str] | None = None) -> int:
+    parser = parser_of(__doc__, "recipe")
     parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS))
     parser.add_argument("--positions", nargs="+", type=int, help="training positions, one or more numbers")
-    parser.add_argument("--held", type=int, help="validation positions that judge")
     parser.add_argument("--steps", type=int, help="iterations; those of the scale when missing")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="decide the order of the pictures")
-    parser.add_argument("--page", type=Path, help="put the table into this page")
-    parser.add_argument("--out", type=Path, default=Path("out/recipe"))
-    return parser.parse_args(words)
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    wish = asked(words)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="of the positions and the pictures' order")
+    wish = parser.parse_args(words)
     try:
-        if wish.page is not None:
-            parted(wish.page)
-        run = measured(wish)
+        run = measured(study_of(wish, "recipe", holdouts=("random",)), wish)
     except RfError as error:
-        print(f"recipe: {error}", file=sys.stderr)
+        say(f"recipe: {error}")
         return 2
-    run["command"] = command_of(sys.argv[1:] if words is None else words)
-    text = page_of(run)
-    write_whole(wish.out / "recipe.json", (json.dumps(run) + "\n").encode())
-    write_whole(wish.out / "recipe.md", (text + "\n").encode())
+    text = f"{page_of(run)}\n\n{made_by('recipe', wish.seeds, words)}"
+    write_json(wish.out / f"recipe-{wish.scale}.json", run)
+    write_whole(wish.out / f"recipe-{wish.scale}.md", (text + "\n").encode())
     print(text)
-    if wish.page is not None:
-        put_into(wish.page, text)
-    return 0
-
-
-def command_of(words: Sequence[str]) -> str:
-    """The command as a page may show it: of files their names alone, and not where it wrote."""
-    kept = [
-        Path(word).name if "/" in word else word
-        for before, word in zip(("", *words), words, strict=False)
-        if not {before, word} & {"--out", "--page"}
-    ]
-    return shlex.join(["python", "-m", "benchmarks.quality.recipe", *kept])
-
-
-def put_into(page: Path, text: str) -> None:
-    """Replace what stands between the two marks of the page."""
-    head, tail = parted(page)
-    write_whole(page, f"{head}\n{text}\n\n{tail}".encode())
-
-
-def parted(page: Path) -> tuple[str, str]:
-    """The page up to the first mark and from the second one; InputError where they are missing."""
-    head, mark, rest = page.read_text(encoding="utf-8").partition("<!-- recipe -->\n")
-    _, end, tail = rest.partition("<!-- end of recipe -->")
-    if not mark or not end:
-        raise InputError(f"{page} has no marks <!-- recipe --> and <!-- end of recipe -->; add them")
-    return head + mark, end + tail
+    return page_or_sentence(wish.page, "recipe", text)
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    sys.exit(main())

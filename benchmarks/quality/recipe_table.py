@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.quality.protocol.figure import rows_of
+
 NAMES = {
     "rf3dgs-jet": "jet colours, 8 bits (published)",
     "rf3dgs-db": "level, one channel",
@@ -43,11 +45,11 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def page_of(run: Mapping[str, Any]) -> str:
-    """The table as Markdown, with the command and what it cost."""
-    parts = [f"`{run['command']}`", caption(run)]
+    """The tables as Markdown, and what they cost."""
+    parts = [caption(run)]
     for count in sorted({row["positions"] for row in run["rows"]}):
         rows = [row for row in run["rows"] if row["positions"] == count]
-        parts += [f"{count} training positions:", scores(rows), differences(rows)]
+        parts += [f"{count} training positions:", scores(rows), differences(rows, run["views"])]
     return "\n\n".join(part for part in parts if part)
 
 
@@ -56,8 +58,8 @@ def caption(run: Mapping[str, Any]) -> str:
     total = sum(row["fit_cpu_s"] + row["judging_cpu_s"] for row in run["rows"])
     width, height = run["size"]
     return (
-        f"{run['held']} validation positions, four pictures of {width}x{height} each; {run['gaussians']:,} Gaussians; "
-        f"{run['steps']:,} iterations; window {low:g} to {high:g} dB; mean over "
+        f"{run['held']} {run['judge']} positions, {run['views']} pictures of {width}x{height} each; "
+        f"{run['gaussians']:,} Gaussians; {run['steps']:,} iterations; window {low:g} to {high:g} dB; mean over "
         f"seeds {', '.join(str(seed) for seed in run['seeds'])}. While errors are small jet RGB is "
         f"{run['jet_gap_db']:.1f} dB below grey. Fits and judging took {total:.0f} s of CPU time."
     )
@@ -65,10 +67,7 @@ def caption(run: Mapping[str, Any]) -> str:
 
 def scores(rows: Rows) -> str:
     """One line a model, then the paper's."""
-    lines = [
-        "| target | " + " | ".join(title for title, _ in COLUMNS.values()) + " | fit, CPU [s] |",
-        "|---|" + "---|" * (len(COLUMNS) + 1),
-    ]
+    lines = []
     for name in dict.fromkeys(row["model"] for row in rows):
         mine = [row for row in rows if row["model"] == name]
         cells = []
@@ -77,19 +76,17 @@ def scores(rows: Rows) -> str:
             value = float(np.median(values) if key == "peak_deg" else np.mean(values))
             cells.append("-" if np.isnan(value) else f"{value:.{digits}f}")
         cost = float(np.mean([row["fit_cpu_s"] for row in mine]))
-        lines.append(f"| {NAMES[name]} | {' | '.join(cells)} | {cost:.1f} |")
+        lines.append([NAMES[name], *cells, f"{cost:.1f}"])
     for title, psnr, ssim in PUBLISHED:
         cells = {"psnr_rgb": psnr, "ssim_rgb": ssim}
-        lines.append(f"| *{title}* | {' | '.join(cells.get(key, '') for key in COLUMNS)} | |")
-    return "\n".join(lines)
+        lines.append([f"*{title}*", *(cells.get(key, "") for key in COLUMNS), ""])
+    return rows_of(["target", *(title for title, _ in COLUMNS.values()), "fit, CPU [s]"], lines)
 
 
-def differences(rows: Rows) -> str:
+def differences(rows: Rows, views: int) -> str:
     """PSNR in the common window between two targets: over positions, one standard error, and each seed's own."""
-    lines = [
-        "| PSNR, grey, difference [dB] | mean and standard error over positions | each seed | found by others |",
-        "|---|---|---|---|",
-    ]
+    head = ["PSNR, grey, difference [dB]", "mean and standard error over positions", "each seed", "found by others"]
+    lines = []
     for better, base in DIFFERENCES:
         first, second = (
             [np.array(row["values"]["psnr_grey"]) for row in rows if row["model"] == name] for name in (better, base)
@@ -97,9 +94,9 @@ def differences(rows: Rows) -> str:
         if not first or not second:
             continue
         each = np.array(first) - np.array(second)  # [seed, picture]
-        places = each.mean(0).reshape(-1, 4).mean(1)
+        places = each.mean(0).reshape(-1, views).mean(1)
         error = f" ± {places.std(ddof=1) / np.sqrt(len(places)):.2f}" if len(places) > 1 else ""
         seeds = ", ".join(f"{value:+.2f}" for value in each.mean(1))
         known = KNOWN.get((better, base), "")
-        lines.append(f"| {NAMES[better]} over {NAMES[base]} | {places.mean():+.2f}{error} | {seeds} | {known} |")
-    return "\n".join(lines) if len(lines) > 2 else ""
+        lines.append([f"{NAMES[better]} over {NAMES[base]}", f"{places.mean():+.2f}{error}", seeds, known])
+    return rows_of(head, lines) if lines else ""

@@ -4,10 +4,14 @@ import json
 
 import pytest
 import torch
-from benchmarks.quality.learned import YAWS, Constant, main, method_of, pictures, room_paths, scores
+from benchmarks.quality.learned import Constant, asked, data, main, method_of, pictures, room_paths, scores
 from benchmarks.quality.methods.method import Task
 from benchmarks.quality.methods.nerf2 import METHODS
+from benchmarks.quality.protocol.figure import SIZES
+from benchmarks.quality.protocol.pictures import YAWS_DEG
+from benchmarks.quality.protocol.split import split_of
 
+from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid
 from rf3dgs.spectra.codec import window_of
@@ -19,11 +23,26 @@ def room_pictures(count, seed):
 
 def test_four_pictures_stand_at_each_place_and_a_seed_draws_the_places():
     spectra = room_pictures(3, 0)
-    assert len(spectra) == 3 * len(YAWS)
-    places = spectra.pose.position.reshape(3, len(YAWS), 3)
+    assert len(spectra) == 3 * len(YAWS_DEG)
+    places = spectra.pose.position.reshape(3, len(YAWS_DEG), 3)
     torch.testing.assert_close(places, places[:, :1].expand_as(places), rtol=0, atol=0)
     torch.testing.assert_close(room_pictures(3, 0).power, spectra.power, rtol=0, atol=0)
     assert not torch.equal(room_pictures(3, 1).pose.position, spectra.pose.position)
+
+
+def test_traced_places_are_those_of_the_figures_and_the_sealed_ones_stay_sealed(room_paths, room_places, tmp_path):
+    words = ["--method", "nerf2", "--scale", "smoke", "--paths", str(room_paths), "--out", str(tmp_path)]
+    task, judge = data(asked([*words, "--positions", "5", "--held", "3"]))
+    split = split_of(room_places, SIZES["smoke"].split)
+    expected = split.training(5, 0), split.part("validation", "random")[:3]
+    for spectra, places in zip((task.spectra, judge), expected, strict=True):
+        assert len(spectra) == len(places) * len(YAWS_DEG)
+        torch.testing.assert_close(
+            spectra.pose.position[:: len(YAWS_DEG)], room_places[torch.from_numpy(places)], rtol=0, atol=1e-5
+        )
+    assert not list(tmp_path.rglob("test_reads.log"))
+    with pytest.raises(InputError, match="4 places are held out and 5 are asked; lower --held"):
+        data(asked([*words, "--held", "5"]))
 
 
 def test_the_truth_scores_perfectly_and_the_constant_does_not():
@@ -77,5 +96,5 @@ def test_the_page_shows_what_was_learned_and_calls_an_extrapolation_one(tmp_path
 
 
 def test_no_places_are_refused_in_one_sentence(tmp_path, capsys):
-    assert main(["--method", "nerf2", "--scale", "smoke", "--held", "0", "--out", str(tmp_path)]) == 1
+    assert main(["--method", "nerf2", "--scale", "smoke", "--held", "0", "--out", str(tmp_path)]) == 2
     assert "--positions and --held must be at least 1; got 40 and 0" in capsys.readouterr().err

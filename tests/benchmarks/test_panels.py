@@ -7,26 +7,27 @@ import re
 import numpy as np
 import pytest
 import torch
-from benchmarks.quality import fig1, fig6, fig6_scores, panel_data
+from benchmarks.quality import fig1, fig6, fig6_scores
 from benchmarks.quality.methods.method import Method
-from benchmarks.quality.panel_data import kept, positions_of
+from benchmarks.quality.panel_data import kept
+from benchmarks.quality.protocol.figure import SIZES, parser_of, study_of
+from benchmarks.quality.protocol.split import split_of
 
 from rf3dgs.channel.io import PathsReader, PathsWriter
 from rf3dgs.channel.paths import Paths
 from rf3dgs.core.angles import angles_of
-from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import pinhole_grid
+from rf3dgs.core.grids import equirect_grid, pinhole_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT
-from rf3dgs.data.split import split_positions
 from rf3dgs.evaluation.baselines.lookup import NearestNeighbour
 from rf3dgs.spectra.codec import DbWindow
+from rf3dgs.spectra.synthesis import default_lobe
 from rf3dgs.splats.ply import write_ply
 from rf3dgs.splats.surface import sample_mesh
 
 TX = torch.tensor([0.5, 0.6, 2.0])
 SIZE = torch.tensor([6.0, 5.0, 2.6])
-RECEIVERS, HAZE = 24, 300
+RECEIVERS, HAZE = 40, 300
 GRID = pinhole_grid(36, 24, 90)
 WINDOW = DbWindow(-80.0, 0.0)
 
@@ -80,6 +81,12 @@ def given(tmp_path_factory):
     return words, write_paths(folder / "fine.h5", rays=4 * HAZE, seed=2)
 
 
+def split_at(paths):
+    """The protocol's split of the receivers of a folder of paths."""
+    with PathsReader(paths) as reader:
+        return split_of(reader.rx.position, SIZES["smoke"].split)
+
+
 def cells(table: str) -> list[list[str]]:
     lines = [line for line in table.splitlines() if line.startswith("|")]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
@@ -90,21 +97,27 @@ def numbers_of(table: str) -> list[float]:
 
 
 def test_figure_1_has_a_row_for_each_method_in_each_group_and_is_made_once(given, tmp_path, monkeypatch):
-    words = [*given[0], "--photo", "gaussians", "--out", str(tmp_path)]
+    page = tmp_path / "page.md"
+    page.write_text("<!-- fig1 -->\n<!-- end of fig1 -->\n")
+    words = [*given[0], "--photo", "gaussians", "--out", str(tmp_path), "--page", str(page)]
     assert fig1.main(words) == 0
-    picture, table = (tmp_path / "fig1.png").read_bytes(), (tmp_path / "fig1.md").read_text()
+    picture, table = (tmp_path / "fig1-smoke.png").read_bytes(), (tmp_path / "fig1-smoke.md").read_text()
+    assert table.rstrip() in page.read_text()
+    assert "python -m benchmarks.quality.fig1 --scale smoke --paths coarse.h5" in table
     assert picture.startswith(b"\x89PNG")
     assert [row[:2] for row in cells(table)] == [
         [group, method.name] for group in fig1.GROUPS.values() for method in fig1.COLUMNS
     ]
     assert all(math.isfinite(number) for number in numbers_of(table))
-    facts = json.loads((tmp_path / "fig1.json").read_text())
-    assert facts["view"] not in facts["training"]
-    assert len(facts["training"]) == 6
+    facts = json.loads((tmp_path / "fig1-smoke.json").read_text())
+    split = split_at(given[0][3])
+    assert facts["view"] == split.part("validation", "random")[0]
+    assert facts["training"] == split.training(6, 0).tolist()
+    assert not list(tmp_path.rglob("test_reads.log"))
 
     monkeypatch.setattr(fig1, "fit_radio", lambda *_: pytest.fail("a field was trained again"))
     assert fig1.main(words) == 0
-    assert (tmp_path / "fig1.png").read_bytes() == picture
+    assert (tmp_path / "fig1-smoke.png").read_bytes() == picture
 
 
 def test_any_method_may_be_a_column_of_figure_1(given, tmp_path, monkeypatch):
@@ -116,14 +129,14 @@ def test_any_method_may_be_a_column_of_figure_1(given, tmp_path, monkeypatch):
 
     monkeypatch.setattr(fig1, "COLUMNS", (Method("mine", fit),))
     assert fig1.main([*given[0], "--photo", "gaussians", "--out", str(tmp_path)]) == 0
-    assert [row[1] for row in cells((tmp_path / "fig1.md").read_text())] == ["mine", "mine"]
+    assert [row[1] for row in cells((tmp_path / "fig1-smoke.md").read_text())] == ["mine", "mine"]
     assert fitted == ["ideal", "capon"]
 
 
 def test_figure_6_says_of_each_candidate_whether_it_is_nearer(given, tmp_path, monkeypatch):
     words = [*given[0], "--truth", str(given[1]), "--out", str(tmp_path)]
     assert fig6.main(words) == 0
-    picture, table = (tmp_path / "fig6.png").read_bytes(), (tmp_path / "fig6.md").read_text()
+    picture, table = (tmp_path / "fig6-smoke.png").read_bytes(), (tmp_path / "fig6-smoke.md").read_text()
     rows = {row[0]: row[1:] for row in cells(table)}
     assert list(rows) == [
         fig6.COARSE,
@@ -132,15 +145,15 @@ def test_figure_6_says_of_each_candidate_whether_it_is_nearer(given, tmp_path, m
     assert all(math.isfinite(number) for number in numbers_of(table))
     assert all("(" not in cell for cell in rows.pop(fig6.COARSE))
     assert all(re.search(r"\((nearer|farther|same)\)$", cell) for row in rows.values() for cell in row[:-1])
-    facts = json.loads((tmp_path / "fig6.json").read_text())
-    with PathsReader(given[0][3]) as reader:
-        roles = split_positions(reader.rx.position, seed=0)
-    assert {roles[number] for number in facts["judged"]} == {"validation"}
-    assert {roles[number] for number in facts["training"]} == {"train"}
+    facts = json.loads((tmp_path / "fig6-smoke.json").read_text())
+    split = split_at(given[0][3])
+    assert facts["judged"] == split.part("validation", "random")[:2].tolist()
+    assert facts["training"] == split.training(6, 0).tolist()
+    assert not list(tmp_path.rglob("test_reads.log"))
 
     monkeypatch.setattr(fig1, "fit_radio", lambda *_: pytest.fail("a field was trained again"))
     assert fig6.main(words) == 0
-    assert (tmp_path / "fig6.png").read_bytes() == picture
+    assert (tmp_path / "fig6-smoke.png").read_bytes() == picture
 
 
 def random_power(seed: int) -> torch.Tensor:
@@ -218,17 +231,10 @@ def test_the_narrower_lobe_has_the_larger_peak(given):
 
 
 def test_points_drawn_finer_keep_their_power(given, tmp_path):
-    words = given[0]
-    with PathsReader(words[3]) as reader:
-        training, judged = positions_of(reader, 6, 0)
-        pictures, lobe = fig6.training_pictures(fig6.SCALES["smoke"])
-        some = panel_data.Some(reader, training)
-        spectra = panel_data.training_spectra(some, pictures, tmp_path / "spectra", {})
-        pose = Pose(reader.rx.position[judged[0]], reader.rx.orientation[judged[0]])
-    geometry = panel_data.geometry_at(panel_data.Path(words[5]), tmp_path, "smoke")
-    task = fig6.Task(spectra, panel_data.window_for(spectra), 0, "smoke", geometry)
-    field = fig1.OURS.made(task)
-    grid = fig6.equirect_grid(180, 90)
+    study = study_of(parser_of("", "fig6").parse_args([*given[0][:-2], "--out", str(tmp_path)]), "fig6")
+    field = fig1.OURS.made(study.task(6, 0))
+    pose, lobe = study.data.dataset.validation.spectra.pose[0], default_lobe(study.config.pictures.grid)
+    grid = equirect_grid(180, 90)
     plain = field.render(pose, grid, csi=False)
     finer = fig6.Sharper(field, lobe / 2).render(pose, grid)
     area = grid.solid_angle
@@ -252,18 +258,20 @@ def test_what_was_made_from_something_else_is_made_again(tmp_path):
     assert torch.equal(kept(tmp_path, "answer", {"seed": 1}, lambda: torch.ones(2)), torch.ones(2))
 
 
-def test_a_finer_truth_that_stands_elsewhere_is_refused(given, tmp_path):
+def test_a_finer_truth_that_stands_elsewhere_is_refused(given, tmp_path, capsys):
     other = tmp_path / "other.h5"
     with PathsReader(given[1]) as reader, PathsWriter(other, 60e9, Pose(TX)) as writer:
-        writer.append(reader[0])
-    with pytest.raises(InputError, match=r"no receiver where number \d+ of the other paths stands; trace it"):
-        fig6.main([*given[0], "--truth", str(other), "--out", str(tmp_path / "out")])
+        writer.append(reader[int(split_at(given[0][3]).where("pool")[0])])
+    assert fig6.main([*given[0], "--truth", str(other), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert re.search(r"fig6: .*no receiver where number \d+ of the other paths stands; trace it", said)
 
 
-def test_too_few_receivers_are_refused(tmp_path, given):
+def test_too_few_receivers_are_refused(tmp_path, given, capsys):
     few = tmp_path / "few.h5"
     with PathsReader(given[1]) as reader, PathsWriter(few, 60e9, Pose(TX)) as writer:
         for number in range(4):
             writer.append(reader[number])
-    with PathsReader(few) as reader, pytest.raises(InputError, match="4 receivers leave none for validation"):
-        positions_of(reader, 2, 0)
+    words = [*given[0][:3], str(few), *given[0][4:], "--out", str(tmp_path / "out")]
+    assert fig1.main(words) == 2
+    assert "fig1: 40 receivers were asked for and the paths have 4; trace more" in capsys.readouterr().err

@@ -37,6 +37,7 @@ from rf3dgs.training.checkpoint import fingerprint
 from rf3dgs.training.lit_views import LEAST_WEIGHT
 
 RANGE_DB = 80.0  # between the window's ends
+FIRST = "first.paths"
 EYES = 100  # receivers that say what of a large site matters
 
 
@@ -67,16 +68,10 @@ class Data:
         return pool.spectra[ours & (pool.spectra.power.amax((-2, -1)) > 0)]
 
     def window(self) -> DbWindow:
-        """The dB window of every score: that of the whole pool, so that it depends on neither model nor cell.
-
-        Levels more than 80 dB below the strongest count as the floor. Where surfaces scatter in narrow lobes a traced
-        spectrum has directions that no path reaches, and what lies between those and a weak path is not a level that
-        an instrument could tell.
-        """
+        """The dB window of every score: that of the whole pool, so that it depends on neither model nor cell."""
         pool = self.dataset.train.spectra
         assert pool is not None
-        found = window_of(pool)
-        return DbWindow(max(found.floor_db, found.ceil_db - RANGE_DB), found.ceil_db)
+        return window_for(pool)
 
     def judged(self, judge: str, holdout: str, reason: str, most: int | None = None) -> Spectrum:
         """The truth `[n x views, row, col]` of a hold-out; a sealed one is logged with the reason.
@@ -90,6 +85,16 @@ class Data:
     def places(self, judge: str, holdout: str) -> Tensor:
         """The positions `[n, 3]` [m] of a hold-out."""
         return self.positions[torch.from_numpy(self.split.part(judge, holdout))]
+
+
+def window_for(spectra: Spectrum) -> DbWindow:
+    """The dB window of spectra, in which levels more than 80 dB below the strongest count as the floor.
+
+    Where surfaces scatter in narrow lobes a traced spectrum has directions that no path reaches, and what lies between
+    those and a weak path is not a level that an instrument could tell.
+    """
+    found = window_of(spectra)
+    return DbWindow(max(found.floor_db, found.ceil_db - RANGE_DB), found.ceil_db)
 
 
 def data_of(
@@ -116,7 +121,7 @@ def data_of(
 
     def traced() -> Path:
         how = TraceConfig() if rays is None else TraceConfig(rays=rays)
-        first = folder / "first.paths"
+        first = folder / FIRST
         return paths or paths_of(setting, first, setting.receivers(receivers), how, progress)
 
     def splitting(positions: Tensor) -> Split:

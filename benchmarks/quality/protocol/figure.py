@@ -48,13 +48,17 @@ SIZES: Mapping[Scale, Size] = {
 }
 
 
-def parser_of(doc: str | None, name: str) -> argparse.ArgumentParser:
-    """The options that every figure has; figures that share a folder share data and cells."""
+def parser_of(doc: str | None, name: str, *, without: str = "traced") -> argparse.ArgumentParser:
+    """The options that every figure has; figures that share a folder share data and cells.
+
+    without: what comes in place of --paths.
+    """
     how, prog = argparse.RawDescriptionHelpFormatter, f"python -m benchmarks.quality.{name}"
     parser = argparse.ArgumentParser(prog, description=doc, formatter_class=how)
+    paths = f"what rf3dgs trace lobby --preset paper wrote; {without} when missing"
     parser.add_argument("--scale", choices=SCALES, default="laptop", help="minutes, hours on two cores, or a GPU")
     parser.add_argument("--out", type=Path, default=Path("out/figures"), help="data, cells and results; kept")
-    parser.add_argument("--paths", type=Path, help="what rf3dgs trace lobby --preset paper wrote; traced when missing")
+    parser.add_argument("--paths", type=Path, help=paths)
     parser.add_argument("--geometry", help="photos, mesh, or a .ply file; photos unless at smoke")
     parser.add_argument("--read-test", action="store_true", help="judge by the sealed positions; logged")
     parser.add_argument("--page", type=Path, help="put the tables into this page, between its marks")

@@ -24,7 +24,15 @@ from benchmarks.quality.protocol.cells import (
     make_second,
     read_cell,
 )
-from benchmarks.quality.protocol.data import Data, data_of, geometry_digest, geometry_of, second_solve, spectra_at
+from benchmarks.quality.protocol.data import (
+    FIRST,
+    Data,
+    data_of,
+    geometry_digest,
+    geometry_of,
+    second_solve,
+    spectra_at,
+)
 from benchmarks.quality.protocol.pictures import SPHERE, Pictures
 from benchmarks.quality.protocol.results import Results
 from benchmarks.quality.protocol.scenes import Setting
@@ -109,6 +117,11 @@ class Study:
     def scene(self) -> Scene:
         """The scene with its preset's materials."""
         return preset_of(self.config.preset).applied(self.setting.scene())[0]
+
+    @property
+    def traced(self) -> Path:
+        """The folder of paths that the data are made from, receiver by receiver."""
+        return self.config.paths.get(self.config.preset) or self._folder(self.setting) / FIRST
 
     @cached_property
     def geometry(self) -> Gaussians:
