@@ -21,7 +21,16 @@ from benchmarks.quality.methods import methods_of
 from benchmarks.quality.methods.field import field
 from benchmarks.quality.methods.method import Method, Scale
 from benchmarks.quality.protocol.cells import SECOND, Extra, Key, Truth
-from benchmarks.quality.protocol.figure import made_by, page_or_sentence, parser_of, rows_of, study_of, told, write_json
+from benchmarks.quality.protocol.figure import (
+    cpu_hours,
+    made_by,
+    page_or_sentence,
+    parser_of,
+    rows_of,
+    study_of,
+    told,
+    write_json,
+)
 from benchmarks.quality.protocol.kept import kept_beside, kept_pictures
 from benchmarks.quality.protocol.panels import panels
 from benchmarks.quality.protocol.results import Place, Results
@@ -134,7 +143,9 @@ def figure(words: Sequence[str] | None) -> int:
     found = {place.holdout: estimates(results, place, (*PUBLISHED, *PHYSICAL)) for place in results.places}
     truth = study.truth("random")
     judged = len(truth.spectra) // truth.views
-    made = made_by(NAME, [wish.seed], words, positions=f"{count} trained on and {judged} of each hold-out judged")
+    more = {"positions": f"{count} trained on and {judged} of each hold-out judged"}
+    more["CPU hours of fits and rendering"] = cpu_hours(results.facts)
+    made = made_by(NAME, [wish.seed], words, **more)
     parts = []
     for holdout, of in found.items():
         parts.append(f"Hold-out `{holdout}`, the paper's pictures:\n\n{table_of(of, PUBLISHED)}")

@@ -17,6 +17,7 @@ from benchmarks.quality.methods.method import Scale
 from benchmarks.quality.protocol.curves import curves_of
 from benchmarks.quality.protocol.figure import (
     command_of,
+    cpu_hours,
     made_by,
     page_or_sentence,
     parser_of,
@@ -131,7 +132,8 @@ def main(words: Sequence[str] | None = None) -> int:
     except RfError as error:
         say(f"fig8: {error}")
         return 2
-    made = made_by("fig8", counts.seeds, words)
+    spent = cpu_hours(fact for results in runs.values() for fact in results.facts)
+    made = made_by("fig8", counts.seeds, words, **{"CPU hours of fits and rendering": spent})
     folder = wish.pictures or wish.out
     numbers = {"command": command_of("fig8", words), "scale": wish.scale}
     pages = []

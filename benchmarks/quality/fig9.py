@@ -22,7 +22,15 @@ from scipy.ndimage import gaussian_filter
 from benchmarks.quality.methods import known, methods_of
 from benchmarks.quality.methods.method import Scale
 from benchmarks.quality.protocol.cells import Extra, Key, Truth
-from benchmarks.quality.protocol.figure import made_by, page_or_sentence, parser_of, rows_of, study_of, write_json
+from benchmarks.quality.protocol.figure import (
+    cpu_hours,
+    made_by,
+    page_or_sentence,
+    parser_of,
+    rows_of,
+    study_of,
+    write_json,
+)
 from benchmarks.quality.protocol.kept import kept_beside, kept_pictures
 from benchmarks.quality.protocol.panels import small_png
 from benchmarks.quality.protocol.results import Results
@@ -189,7 +197,7 @@ def main(words: Sequence[str] | None = None) -> int:
             f"**Pairs of methods at one view** whose eigenbeam losses differ by at least {CLEAR_DB:g} dB: how often "
             "the score prefers the one that loses more (50 % is a coin)",
             rows_of(["score", "prefers the worse", "pairs"], orders),
-            made_by("fig9", [wish.seed], words),
+            made_by("fig9", [wish.seed], words, **{"CPU hours of fits and rendering": cpu_hours(results.facts)}),
         ]
     )
     draw(study, results, found, wish)

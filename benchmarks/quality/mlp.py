@@ -31,10 +31,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from benchmarks.quality.radiance.data import Data, data_of, geometry_of
-from benchmarks.quality.radiance.models import model_of
-from benchmarks.quality.radiance.scenes import Setting
-from benchmarks.quality.radiance.split import HOLDOUTS, SplitConfig
+from benchmarks.quality.methods import known
+from benchmarks.quality.methods.method import Task
+from benchmarks.quality.protocol.data import Data, data_of, geometry_of
+from benchmarks.quality.protocol.scenes import Setting
+from benchmarks.quality.protocol.split import HOLDOUTS, SplitConfig
 from rf3dgs.channel.arrays import planar_array
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid
@@ -167,7 +168,7 @@ def main() -> None:
     data = data_of(setting, own.out / "data" / "lobby-diffuse", SplitConfig(), receivers=480, paths=own.paths)
     geometry = geometry_of(own.geometry, setting, own.out / "geometry" / "lobby", count=100_000)
     train = data.training(POSITIONS, SEED)
-    field = model_of("mirror").made(train, geometry, SEED, data.window().floor_db)
+    field = known()["mirror"].made(Task(train, data.window(), SEED, "paper", geometry))
     assert isinstance(field, RadioField)
     assert isinstance(field.surface, LitSurface)
     assert field.sources is not None

@@ -4,7 +4,7 @@ import argparse
 import json
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -126,6 +126,15 @@ def made_by(name: str, seeds: Sequence[int], words: Sequence[str] | None = None,
     rest = "".join(f", {key} {value}" for key, value in more.items())
     drawn = ", ".join(map(str, seeds))
     return f"Made by `{command_of(name, words)}`, seeds {drawn}, on {machine()}{rest}; commit {commit()}."
+
+
+def cpu_hours(facts: Iterable[Mapping[str, Any]]) -> str:
+    """What fits and renderings took together on one core, of the facts of cells; a fit that two cells share once."""
+    fits, drawn = {}, 0.0
+    for fact in facts:
+        fits[tuple(value for name, value in fact["key"].items() if name != "holdout")] = fact["fit"]["cpu_seconds"]
+        drawn += fact["rendering"]["cpu_seconds"]
+    return f"{(sum(fits.values()) + drawn) / 3600:.2f}"
 
 
 def write_json(path: Path, numbers: Mapping[str, Any]) -> None:
