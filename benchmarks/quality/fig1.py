@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.quality.methods import known
 from benchmarks.quality.methods.method import Method, Scale, Task
 from benchmarks.quality.panel_data import answered, held_out, like, show, small_png, turned
 from benchmarks.quality.protocol.figure import made_by, page_or_sentence, parser_of, rows_of, study_of, write_json
@@ -98,7 +99,9 @@ PAPER = Method(
     lambda task: asdict(paper_settings(task)),
 )
 NEAREST = Method("nearest neighbour", lambda task: NearestNeighbour(task.spectra))
-COLUMNS: tuple[Method, ...] = (OURS, PAPER, NEAREST)
+SPLATS_AND_COPY = (OURS, PAPER, NEAREST)
+NERF2 = replace(known()["nerf2-db"], name="NeRF2, dB target")
+COLUMNS: tuple[Method, ...] = (*SPLATS_AND_COPY, NERF2)
 """The columns after the truth; any `Method` may be put here."""
 
 

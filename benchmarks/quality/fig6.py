@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.quality.fig1 import COLUMNS, OURS, TRAINING
+from benchmarks.quality.fig1 import OURS, SPLATS_AND_COPY, TRAINING
 from benchmarks.quality.fig6_scores import COLUMNS as SCORES
 from benchmarks.quality.fig6_scores import blur_of, detail_of, interval, scores, truth_of, verdict
 from benchmarks.quality.methods.method import Scale
@@ -189,7 +189,7 @@ def made(wish: argparse.Namespace) -> tuple[bytes, dict[str, Any], str]:
     first, second = (finer_truth(study, wish.truth, numbers, paths, again) * rise for again in (False, True))
     solves, truth = (first, second), (first + second) / 2
     answers = {COARSE: coarse.power}
-    for method in COLUMNS:
+    for method in SPLATS_AND_COPY:
         say(method.name)
         trained = cache(lambda method=method: method.made(task))
         answers[method.name] = answered(method, task, coarse.pose, grid, folder, trained)

@@ -48,7 +48,8 @@ METHODS = ("nearest", "constant", "rf3dgs-jet", "rf3dgs-db", "nerf2", "nerf2-db"
 POSITIONS: Mapping[Scale, int] = {"smoke": 8, "laptop": 40, "paper": 160}
 PICTURE_SCORES = ("psnr", "ssim", "flip", "lpips", "rmse_db", "wasserstein")
 PHYSICS = ("peak_median", "peak_within_1", "beam_loss_eigen", "path_gain")
-IN_PANEL = ("psnr", "ssim", "flip", "rmse_db", "peak_median", "beam_loss_eigen")
+SHORT = {"psnr": "PSNR", "ssim": "SSIM", "flip": "FLIP", "rmse_db": "RMSE", "peak_median": "peak"}
+SHORT |= {"beam_loss_eigen": "beam loss"}
 KEPT = 160  # pictures, one of which is shown
 CLEAR_DB = 1.0  # two beam losses this far apart are told apart
 Values = Mapping[str, np.ndarray]
@@ -138,7 +139,7 @@ def panels(truth: Truth, rows: Sequence[tuple[str, np.ndarray, Mapping[str, floa
     window = window_of_view(truth)
     with mpl.rc_context({**STYLE, "font.size": 7}):
         columns = 4
-        figure = Figure(figsize=(10.6, 2.35 * -(-len(rows) // columns)), dpi=100, layout="constrained")
+        figure = Figure(figsize=(10.6, 2.5 * -(-len(rows) // columns)), dpi=100, layout="constrained")
         axes = figure.subplots(-(-len(rows) // columns), columns, squeeze=False).ravel()
         for axis in axes:
             axis.set_axis_off()
@@ -149,9 +150,11 @@ def panels(truth: Truth, rows: Sequence[tuple[str, np.ndarray, Mapping[str, floa
 
 
 def caption(values: Mapping[str, float], shown: Sequence[Score]) -> str:
-    """The scores in two lines."""
-    texts = [f"{one.label} {one.text(values[one.column])} {one.unit}".rstrip() for one in shown if one.column in values]
-    return f"{', '.join(texts[:3])}\n{', '.join(texts[3:])}"
+    """The scores in three lines."""
+    texts = [
+        f"{SHORT[one.key]} {one.text(values[one.column])} {one.unit}".rstrip() for one in shown if one.column in values
+    ]
+    return "\n".join(", ".join(texts[start : start + 2]) for start in (0, 2, 4))
 
 
 def window_of_view(truth: Truth) -> DbWindow:
@@ -187,7 +190,9 @@ def main(words: Sequence[str] | None = None) -> int:
         return [name, *(score.text(score.of(values[score.column])) for score in (*pictures, *physics))]
 
     shares = {score.key: misorders(results, "random", score, wish.seed) for score in (*pictures, SCORE["peak_median"])}
-    orders = [[SCORE[key].label, f"{share:.0f} %", str(pairs)] for key, (share, pairs) in shares.items()]
+    orders = [
+        [SCORE[key].label, f"{share:.0f} %" if pairs else "n/a", str(pairs)] for key, (share, pairs) in shares.items()
+    ]
     text = "\n\n".join(
         [
             f"**Harmed truths**, {len(truth.spectra)} pictures",
@@ -217,12 +222,11 @@ def plain(value):
 
 
 def draw(study: Study, results: Results, found: Mapping[str, Values], wish: argparse.Namespace) -> None:
-    """The panels of the view whose strongest beam stands out most among those kept."""
+    """The panels of the view, among those kept, to which most power comes."""
     truth = study.truth("random")
-    level = db_from_power(truth.spectra.power[:KEPT]).flatten(1)
-    view = int((level.amax(1) - level.median(1).values).argmax())
+    view = int(truth.spectra.path_gain[:KEPT].argmax())
     random, floor = np.random.default_rng(wish.seed), truth.window.floor_db
-    shown = [SCORE[key] for key in IN_PANEL if key in SCORE]
+    shown = [SCORE[key] for key in SHORT if key in SCORE]
     true_level = np.maximum(db_from_power(truth.spectra.power[view]).numpy(), floor)
 
     def of_view(values: Values) -> dict[str, float]:

@@ -15,7 +15,7 @@ MARKS = "os^vDPX*<>hp"
 def curves_of(results: Results, scores: Sequence[Score]) -> bytes:
     """A row for each hold-out and draw, a column for each score; bars are 95 % intervals, dotted the second solve.
 
-    A method that was trained once is a mark of its own.
+    A method that was trained once is a mark of its own, and where it lies far off it is left outside.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -34,6 +34,8 @@ def curves_of(results: Results, scores: Sequence[Score]) -> bytes:
                 second = results.second(places[0], score)
                 if second is not None and np.isfinite(second.value):
                     axis.axhline(second.value, color="#70757d", linestyle=":", label="second solve")
+                low, high = _limits(results, places, names, score)
+                axis.set_ylim(low, high)
                 axis.set_xscale("log")
                 counts = sorted({place.count for place in places})
                 axis.set_xticks(counts, [str(count) for count in counts])
@@ -47,6 +49,20 @@ def curves_of(results: Results, scores: Sequence[Score]) -> bytes:
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png")
     return buffer.getvalue()
+
+
+def _limits(results: Results, places: Sequence[Place], names: Sequence[str], score: Score) -> tuple[float, float]:
+    """Ends of the axis: all that was trained more than once, with a margin; everything where nothing was."""
+    values: dict[str, list[float]] = {}
+    for name in names:
+        found = [results.estimate(place, name, score) for place in places]
+        values[name] = [one.value for one in found if one is not None and np.isfinite(one.value)]
+    curves = [value for of in values.values() if len(of) > 1 for value in of]
+    second = results.second(places[0], score)
+    curves = curves or [value for of in values.values() for value in of] or [0.0]
+    curves += [second.value] if second is not None and np.isfinite(second.value) else []
+    margin = 0.25 * max(max(curves) - min(curves), 1e-6)
+    return min(curves) - margin, max(curves) + margin
 
 
 def _curve(
