@@ -18,7 +18,7 @@ from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.surface import normals, sample_mesh
-from rf3dgs.training import corrected, geometry_from_spectra
+from rf3dgs.training import corrected, geometry_from_spectra, radio_geometry
 from rf3dgs.training.echo_planes import behind, filled, in_free_space, refined_by_echoes
 from rf3dgs.training.echoes import Echoes, echoes_of, merged
 
@@ -255,3 +255,11 @@ def test_corrected_geometry_has_its_walls_where_the_echoes_are():
     assert bool(((found.means > -0.1) & (found.means < HIGH + 0.1)).all())
     apart = torch.cdist(room(0.3).means, found.means).amin(-1)
     assert float((apart < 0.15).double().mean()) > 0.97
+
+
+def test_where_no_plane_is_found_geometry_stays_and_none_is_made_of_echoes(monkeypatch):
+    monkeypatch.setattr(radio_geometry, "SEARCH", replace(radio_geometry.SEARCH, min_area=1e6))
+    before = room(0.1)
+    assert torch.equal(corrected(before, single()).means, before.means)
+    with pytest.raises(InputError, match="echoes lie on no common plane"):
+        radio_geometry.geometry_of_echoes(echoes_of(single(), TX))

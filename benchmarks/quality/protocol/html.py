@@ -26,7 +26,8 @@ def html_of(
         for place in results.places
     ]
     machines = Counter(fact["made"]["machine"] for fact in results.facts)
-    about = {"Made by": made, "Machine": ", ".join(machines), "Judged by": f"{results.judge} positions"}
+    about = {"Made by": made.removeprefix("Made by "), "Machine": ", ".join(machines)}
+    about["Judged by"] = f"{results.judge} positions"
     parts = [section("What this is", facts(about)), *drawn, *tables, section("What it cost", _costs(results))]
     return page(title, lead, parts)
 

@@ -30,6 +30,8 @@ def consolidated(surfaces: Surfaces, means: Tensor) -> Surfaces:
     Gaussians'.
     """
     planes, patches = surfaces.planes, surfaces.patches
+    if not len(planes):
+        return surfaces
     points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
     areas, whole = patches.areas, torch.arange(len(planes))
     for large in areas.argsort(descending=True, stable=True).tolist():

@@ -65,13 +65,18 @@ def geometry_of_echoes(echoes: Echoes, *, seed: int = 0) -> Gaussians:
             f"{len(echoes)}. Give spectra at more positions, or check the transmitter"
         )
     spots = merged(echoes, SPOT)
-    return _with_planes(*_planes_of(echoes, spots, seed), spots)
+    planes, patches = _planes_of(echoes, spots, seed)
+    if not len(planes):
+        raise InputError(f"{len(echoes)} echoes lie on no common plane; give spectra at more positions, or finer ones")
+    return _with_planes(planes, patches, spots)
 
 
 def _planes_of(echoes: Echoes, spots: Spots, seed: int) -> tuple[Planes, Patches]:
     """The planes through echoes, which are merged in `spots`, and where they have surface."""
     rough = _flat(spots.points, spots.normals, SPOT)
     surfaces = consolidated(find_surfaces(rough, echoes.receivers, replace(SEARCH, seed=seed)), rough.means)
+    if not len(surfaces.planes):
+        return surfaces.planes, surfaces.patches
     planes, _ = refined_by_echoes(surfaces.planes, surfaces.patches, echoes)
     return planes, filled(planes, _moved(surfaces.patches, surfaces.planes, planes), echoes)
 
@@ -81,19 +86,22 @@ def corrected(geometry: Gaussians, spectra: Spectrum, tx: Pose | None = None, *,
 
     Planes move to where their echoes lie, and what is near them and along them goes flat onto them. Other Gaussians are
     left out in places that waves were seen to cross and behind what bounds the site. Surfaces that only echoes tell of
-    are added. With fewer than 100 echoes nothing changes. Raises InputError for spectra without delay or departure.
+    are added. With fewer than 100 echoes, or without planes, nothing changes. Raises InputError for spectra without
+    delay or departure.
     """
     geometry = geometry.detach()
     echoes = echoes_of(spectra, _transmitter(spectra, tx).position)
     if len(echoes) < LEAST_ECHOES:
         return geometry
+    spots = merged(echoes, SPOT)
+    walls, extents = _planes_of(echoes, spots, seed)
     surfaces = consolidated(find_surfaces(geometry, echoes.receivers, SurfaceConfig(seed=seed)), geometry.means)
+    if not len(walls) or not len(surfaces.planes):
+        return geometry
     planes, witnesses = refined_by_echoes(surfaces.planes, surfaces.patches, echoes)
     trusted = witnesses * REGION**2 > TRUSTED * surfaces.patches.areas
     trusted &= witnesses >= LEAST_WITNESSES
     moved = flattened(geometry, surfaces, planes, trusted)
-    spots = merged(echoes, SPOT)
-    walls, extents = _planes_of(echoes, spots, seed)
     loose = ~torch.cat((trusted, trusted.new_zeros(1)))[surfaces.plane_of]  # -1, off the planes, is the last one
     haze = loose & (in_free_space(moved.means, echoes) | behind(moved.means, walls, extents, echoes))
     kept = Gaussians(**{name: part[~haze] for name, part in moved.tensors().items()})
