@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 from rf3dgs.core.errors import InputError
@@ -33,8 +32,6 @@ class Task:
     """Gaussians of the site, of photographs or on a mesh; for methods that need "geometry"."""
     scene: Scene | None = None
     """The site as it is, with its preset's materials; for methods that need "scene"."""
-    folder: Path | None = None
-    """Where a method may leave what explains it, such as a training curve; None: nowhere."""
 
 
 @dataclass(frozen=True)

@@ -154,7 +154,7 @@ class Study:
         config, before = self.config, self.before
         train = before.training(count, seed, draw)
         gaussians = self.geometry if geometry else None
-        return Task(train, before.window(), seed, config.scale, gaussians, self.scene, config.out / "curves")
+        return Task(train, before.window(), seed, config.scale, gaussians, self.scene)
 
     def add(
         self,
