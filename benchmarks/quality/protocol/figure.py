@@ -154,23 +154,23 @@ def put_into(page: Path, name: str, text: str) -> None:
 
 
 def told(name: str, run: Callable[[], int]) -> int:
-    """The exit status of a run; what it refuses is told in one sentence."""
+    """The exit status of a run; what it refuses, or cannot read or write, is told in one sentence."""
     try:
         return run()
-    except RfError as error:
+    except (OSError, RfError) as error:
         say(f"{name}: {error}")
         return 2
 
 
 def page_or_sentence(page: Path | None, name: str, text: str) -> int:
-    """Put a figure's text into a page where one is named; the exit status, after a sentence where that failed."""
-    try:
+    """Put a figure's text into a page where one is named; the exit status."""
+
+    def put() -> int:
         if page is not None:
             put_into(page, name, text)
-    except (OSError, InputError) as error:
-        say(f"{name}: {error}")
-        return 2
-    return 0
+        return 0
+
+    return told(name, put)
 
 
 def rows_of(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
