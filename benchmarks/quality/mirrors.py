@@ -13,7 +13,7 @@ errors of what was found. Positions without line of sight are also told apart.
 import argparse
 import json
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -41,7 +41,7 @@ STRONG = 1e-3
 ANGLE, DELAY, LEVEL_DB = 1.0, 1e-9, 2.0  # degrees, seconds, decibels
 VARIANTS = {
     "line of sight": SourceConfig(order=0),
-    "planes as they are": SourceConfig(refine=False, complete=False),
+    "planes as they are": SourceConfig(refine=False, complete=False, square=False),
     "refined": SourceConfig(complete=False),
     "refined, completed": SourceConfig(),
     "order 3": SourceConfig(order=3),
@@ -131,9 +131,9 @@ def main() -> None:
     results = {}
     for name in options.variants:
         started = time.process_time()
-        fit = fit_sources(train, surfaces, obstacles, open_scene("lobby").tx, VARIANTS[name])
+        fit = fit_sources(train, surfaces, obstacles, open_scene("lobby").tx, VARIANTS[name], geometry=geometry)
         seconds = time.process_time() - started
-        figures = compare(truths, fit.sources.rays_each(receivers, replace(obstacles, labels=fit.plane_of)))
+        figures = compare(truths, fit.sources.rays_each(receivers, fit.obstacles))
         results[name] = figures | {"sources": float(len(fit.sources)), "seconds": seconds}
         parts = [
             f"{figures[f'found {order}']:.0f} ({figures[f'right {order}']:.0f})/{figures[f'of {order}']:.0f}"

@@ -8,7 +8,8 @@ random; a fifth in one region behind a buffer; or the half beyond the middle of 
 trained box. The field is fitted to the rest with its uncertainty, and at what was held out the share of errors within
 the interval of each nominal share is counted, over solid angle, for the directions of the spectra and for the eight
 strongest paths of each position (the spectrum's level in the direction of the path). `normal` are the shares that
-multiples of the standard deviation by a normal distribution hold. Medians of the standard deviation tell near from far.
+multiples of the standard deviation by a normal distribution hold. Medians of the standard deviation, and of half the
+intervals of paths, tell near from far.
 Writes sureness.json and coverage.png.
 """
 
@@ -89,7 +90,7 @@ def score(geometry: Gaussians, spectra: Spectrum, holdout: str, seed: int) -> Sc
     assert field.doubt is not None
     widths = [field.doubt.width(share) for share in NOMINAL]
     normal = [float(torch.erfinv(torch.tensor(share))) * 2**0.5 for share in NOMINAL]
-    at_paths, path_std = path_errors(field, truth)
+    at_paths, sizes = path_errors(field, truth)
 
     def shares(wrong: Tensor, sure: Tensor, weight: Tensor, by: list[float]) -> list[float]:
         return [float((weight * (wrong < width * sure)).sum() / weight.sum()) for width in by]
@@ -97,11 +98,12 @@ def score(geometry: Gaussians, spectra: Spectrum, holdout: str, seed: int) -> Sc
     covered = {
         "directions": shares(error, std, counts, widths),
         "normal": shares(error, std, counts, normal),
-        "paths": shares(at_paths, path_std, torch.ones_like(at_paths), widths),
+        "paths": [float((at_paths < size).float().mean()) for size in sizes],
     }
     inside = field.covers(truth.pose, margin=0.0)
     seen = field.uncertainty(spectra.pose[train[:8]], truth.grid)
-    deviations = {"at training positions": seen.median(), "held out": std.median(), "paths": path_std.median()}
+    deviations = {"at training positions": seen.median(), "held out": std.median()}
+    deviations |= {f"paths {share:.0%}": size.median() for share, size in zip(NOMINAL, sizes, strict=True)}
     if bool(inside.any()):
         deviations["inside the box"] = std[inside].median()
     if not bool(inside.all()):
@@ -141,16 +143,16 @@ def errors(field: RadioField, truth: Spectrum) -> tuple[Tensor, Tensor]:
     return (shown.clamp_min(low) - true.clamp_min(low)).abs(), counts
 
 
-def path_errors(field: RadioField, truth: Spectrum) -> tuple[Tensor, Tensor]:
-    """|error| and standard deviation `[path]` [dB] of the level in the pixel of each of the field's paths."""
+def path_errors(field: RadioField, truth: Spectrum) -> tuple[Tensor, list[Tensor]]:
+    """|error| `[path]` [dB] of the level in the pixel of each of the field's paths, and for each nominal share half of
+    the interval that should hold it."""
     paths = field.paths(truth.pose, strongest=8)
-    std = field.uncertainty_of(paths)
+    sizes = [field.uncertainty_of(paths, share=share)[paths.valid] for share in NOMINAL]
     shown = field.render(truth.pose, truth.grid, csi=False)
     x, y = truth.grid.pixel_of(truth.pose.to_device(paths.aoa))[0].unbind(-1)
     col, row = x.long().clamp(0, truth.grid.width - 1), y.long().clamp(0, truth.grid.height - 1)
     place = torch.arange(len(truth))[:, None].expand_as(row)
-    error = (shown.gain_db - truth.gain_db)[place, row, col].abs()
-    return error[paths.valid], std[paths.valid]
+    return (shown.gain_db - truth.gain_db).abs()[place, row, col][paths.valid], sizes
 
 
 def told(one: Score) -> str:
@@ -162,7 +164,7 @@ def told(one: Score) -> str:
     ]
     rows += [f"  {name:<11} " + " ".join(f"{100 * share:5.1f}" for share in row) for name, row in one.covered.items()]
     rows.append("  68 % by position, from " + f"{100 * min(one.by_position):.0f} to {100 * max(one.by_position):.0f}")
-    rows.append("  median std: " + ", ".join(f"{name} {value:.2f} dB" for name, value in one.std_db.items()))
+    rows.append("  medians: " + ", ".join(f"{name} {value:.2f} dB" for name, value in one.std_db.items()))
     return "\n".join(rows)
 
 

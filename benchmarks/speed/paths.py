@@ -2,7 +2,7 @@
 
     python -m benchmarks.speed.paths [--page docs/performance.md] [--count 100000] [--poses 200]
 
-The field is the lobby's mesh with mirrors of order 2. Pictures of 300x200 are drawn of the surface alone and with the
+The field is the lobby's mesh with mirrors of order 3. Pictures of 300x200 are drawn of the surface alone and with the
 sources in turn, so that both meet the same load.
 """
 
@@ -41,7 +41,7 @@ def lobby_field(count: int) -> RadioField:
     assert train is not None
     geometry = geometry_of_mesh(open_scene("lobby"), count, 0)
     return fit_radio(
-        geometry, train, RadioConfig(model="paper", steps=0, start="grey", detail="keep", mirror_order=2, csi_every=0)
+        geometry, train, RadioConfig(model="paper", steps=0, start="grey", detail="keep", mirror_order=3, csi_every=0)
     )
 
 

@@ -248,11 +248,12 @@ def test_a_lit_field_comes_back_from_disk_and_saving_it_again_changes_nothing(tm
     surface = floor(0.3)
     drawn = {name: getattr(surface, name) for name in ("level", "segment_csi", "cell_csi", "own_csi")}
     drawn = {name: torch.randn(tensor.shape, generator=generator) for name, tensor in drawn.items()}
-    surface = replace(surface, **drawn)
+    surface = replace(surface, lobe=0.07, **drawn)
     before = field_of(surface)
     before.save(tmp_path / "one.field")
     after = load_field(tmp_path / "one.field")
     assert isinstance(after.surface, LitSurface)
+    assert after.surface.lobe == 0.07
     torch.testing.assert_close(after.surface.laws, surface.laws, rtol=0, atol=0)
     for name, tensor in drawn.items():
         torch.testing.assert_close(getattr(after.surface, name), tensor.half().float(), rtol=0, atol=0)
@@ -278,9 +279,12 @@ def test_a_file_of_before_delay_and_departure_had_a_residual_loads_without_one(t
     surface = floor(0.3)
     surface = replace(surface, own_csi=torch.ones(len(surface), 4))
     field_of(surface).save(tmp_path / "a.field")
-    rewritten(tmp_path / "a.field", lambda body: body.pop("csi_coefficients"))
+    rewritten(tmp_path / "a.field", lambda body: (body.pop("csi_coefficients"), body.pop("lobe")))
     # An older file lacks the tensors as well; what a description does not name is not looked at.
-    assert float(load_field(tmp_path / "a.field").surface.own_csi.abs().max()) == 0.0
+    older = load_field(tmp_path / "a.field").surface
+    assert isinstance(older, LitSurface)
+    assert float(older.own_csi.abs().max()) == 0.0
+    assert older.lobe == 0.0
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import copy
 import math
 import pickle
 import time
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -252,6 +253,34 @@ def test_a_lit_surface_sees_the_transmitter_and_the_one_behind_does_not() -> Non
     visible = visibility_of(obstacles, obstacles.means, normals, tx, obstacles.labels)
     assert float(visible[inner & (obstacles.labels == 0)].min()) > 0.99
     assert float(visible[inner & (obstacles.labels == 1)].max()) < 0.1
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_segment_that_is_known_to_be_free_is_cleared(seed: int) -> None:
+    cloud, labels, start, end, skips = random_scene(seed, 200)
+    obstacles = Obstacles(*cloud, labels)
+    some = {name: skip[100:160] for name, skip in skips.items()}
+    start, end = start[100:160], end[100:160]
+    before = obstacles.transmittance(start, end, **some)
+    cleared = obstacles.cleared(start, end, **some)
+    after = cleared.transmittance(start, end, **some)
+    assert float(before.min()) < 0.5
+    assert bool((after >= before - TOLERANCE).all())
+    # What is left of a Gaussian in the way is under the opacity that counts, or its rim stops a twentieth.
+    assert float(after.min()) > 0.8
+    assert bool((cleared.opacities <= obstacles.opacities).all())
+    # Alone in its segment, a Gaussian in the middle of it keeps a twentieth, which counts as nothing.
+    lump = Obstacles(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.1), torch.tensor([0.9]))
+    ends = torch.tensor([[-1.0, 0, 0]]), torch.tensor([[1.0, 0, 0]])
+    assert float(lump.cleared(*ends).opacities) == pytest.approx(0.05, rel=1e-5)
+    aside = torch.tensor([0.0, 0.2, 0.0])  # two standard deviations off: 0.05 / exp(-2)
+    assert float(lump.cleared(ends[0] + aside, ends[1] + aside).opacities) == pytest.approx(
+        0.05 * math.exp(2), rel=1e-4
+    )
+    far = torch.tensor([0.0, 0.6, 0.0])
+    assert float(lump.cleared(ends[0] + far, ends[1] + far).opacities) == pytest.approx(0.9)
+    labelled = replace(lump, labels=torch.tensor([4]))
+    assert float(labelled.cleared(*ends, skip_start=torch.tensor([4])).opacities) == pytest.approx(0.9)
 
 
 def test_wrong_shapes_and_missing_labels_are_refused() -> None:

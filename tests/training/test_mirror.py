@@ -8,8 +8,9 @@ import torch
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import equirect_grid, list_grid
+from rf3dgs.core.grids import equirect_grid, list_grid, view_of
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
+from rf3dgs.field.beam import through_lobe
 from rf3dgs.field.lit import LitSurface
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.gaussians import Gaussians
@@ -34,7 +35,8 @@ def room(spacing: float = 0.2) -> Gaussians:
 
 
 def measure(pose: Pose, grid=None) -> Spectrum:
-    """Lit and ambient power of the walls by one law, and the line of sight; ambient waves take 12 ns to the wall."""
+    """Lit and ambient power of the walls by one law through the lobe, and the line of sight; ambient waves take 12 ns
+    to the wall."""
     grid = equirect_grid(90, 45) if grid is None else grid
     here = pose.position[:, None, None, :]
     directions = pose.to_world(grid.directions.expand(len(pose), *grid.shape, 3))
@@ -54,10 +56,14 @@ def measure(pose: Pose, grid=None) -> Spectrum:
     distance = torch.linalg.vector_norm(straight, dim=-1)
     cosine = (directions * straight / distance[..., None]).sum(-1).clamp(-1, 1)
     line = LOBE.kernel(torch.acos(cosine)) * friis_gain(distance, 60e9)
-    power = lit + ambient + line
-    delay = lit * (first + second) + ambient * (second + 12e-9 * SPEED_OF_LIGHT) + line * distance
-    aod = -lit[..., None] * w - line[..., None] * straight / distance[..., None] + ambient[..., None] * torch.eye(3)[2]
-    aod = torch.nn.functional.normalize(aod, dim=-1)
+    late = lit * (first + second) + ambient * (second + 12e-9 * SPEED_OF_LIGHT)
+    left = -lit[..., None] * w + ambient[..., None] * torch.eye(3)[2]
+    walls = torch.cat(((lit + ambient)[..., None], late[..., None], left), -1)
+    if grid.kind != "list":
+        walls = torch.stack([through_lobe(one, view_of(pose[i], grid), LOBE.lobe) for i, one in enumerate(walls)])
+    power = walls[..., 0] + line
+    delay = walls[..., 1] + line * distance
+    aod = torch.nn.functional.normalize(walls[..., 2:] - (line / distance)[..., None] * straight, dim=-1)
     return Spectrum(power, grid, pose, 60e9, LOBE, "ideal", delay / power / SPEED_OF_LIGHT, aod, Pose(TX))
 
 

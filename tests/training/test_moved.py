@@ -121,7 +121,9 @@ def test_measurements_at_the_new_place_make_the_moved_field_better_elsewhere(mov
         shown = field.render(truth.pose, truth.grid, csi=False)
         return float((shown.gain_db - truth.gain_db).square().mean().sqrt())
 
-    assert error_db(better) < 0.8 * error_db(moved)
+    # The moved field is 2.5 dB off (4.5 with one ambient level for all surfaces).
+    assert error_db(moved) < 3.0
+    assert error_db(better) < min(2.3, 0.9 * error_db(moved))
     assert better.sources is moved.sources
     assert torch.equal(better.surface.laws, moved.surface.laws)
     assert float(moved.surface.level.abs().max()) == 0.0

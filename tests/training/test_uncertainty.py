@@ -9,7 +9,7 @@ import torch
 
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import equirect_grid, pinhole_grid
+from rf3dgs.core.grids import equirect_grid, list_grid, pinhole_grid
 from rf3dgs.core.units import friis_gain
 from rf3dgs.field.io import _digest, load_field
 from rf3dgs.field.uncertainty import NUMBERS, SHARES, Uncertainty, numbers_of
@@ -99,14 +99,25 @@ def test_outside_of_the_trained_box_it_is_less_sure(field):
     assert float(far) > 1.15 * float(near)
 
 
-def test_paths_are_as_sure_as_their_direction(field, held_out):
+def test_peaks_of_the_surface_are_as_sure_as_their_direction(field, held_out):
     paths = field.paths(held_out.pose, strongest=40)
-    std = field.uncertainty_of(paths)
+    std, wide = field.uncertainty_of(paths), field.uncertainty_of(paths, share=0.95)
     assert std.shape == paths.valid.shape
     assert bool((std[~paths.valid] == 0).all())
     assert bool((std[paths.valid] > 0).all())
-    wide = field.uncertainty_of(paths, share=0.95)
-    torch.testing.assert_close(wide, std * field.doubt.width(0.95))
+    surface = paths.valid & (paths.kind == 2)
+    assert int(surface.sum()) > 20
+    torch.testing.assert_close(wide[surface], std[surface] * field.doubt.width(0.95))
+    toward = list_grid(held_out.pose[0].to_device(paths.aoa[0]))
+    directions = field.uncertainty(held_out.pose[0], toward)[0]
+    torch.testing.assert_close(std[0][surface[0]], directions[surface[0]])
+
+
+def test_the_straight_way_is_surer_than_the_speckled_wall(field, held_out):
+    paths = field.paths(held_out.pose, strongest=1)
+    assert bool((paths.kind == 0).all())
+    speckled = field.uncertainty(held_out.pose, held_out.grid, share=0.9)[hits(held_out.pose)[1]]
+    assert float(field.uncertainty_of(paths, share=0.9).max()) < 0.5 * float(speckled.median())
 
 
 def test_wider_shares_are_wider(field, held_out):
@@ -133,6 +144,8 @@ def test_uncertainty_comes_back_from_disk_and_older_fields_refuse(field, trainin
     # Rotations and levels are float16 in the file: a depth gate opens here or there.
     assert float((before / after).log().abs().median()) < 0.01
     assert torch.equal(loaded.doubt.seen, field.doubt.seen)
+    for name in ("points", "plane", "off", "wrong", "levels"):
+        assert torch.equal(getattr(loaded.doubt.paths, name), getattr(field.doubt.paths, name)), name
     replace(field, doubt=None).save(tmp_path / "unsure.field")
     path = tmp_path / "unsure.field" / "field.json"
     body = json.loads(path.read_text())["body"]
@@ -150,6 +163,9 @@ def test_damaged_uncertainty_is_refused(field, tmp_path):
     replace(field, doubt=short).save(tmp_path / "short.field")
     with pytest.raises(DataError, match="doubt_spread_db must be"):
         load_field(tmp_path / "short.field")
+    unknown = replace(field.doubt, paths=replace(field.doubt.paths, levels=torch.full((7,), torch.nan)))
+    with pytest.raises(InputError, match="doubt_paths_levels has NaN"):
+        replace(field, doubt=unknown).save(tmp_path / "unknown.field")
 
 
 def test_the_same_spectra_give_the_same_uncertainty(field, training):

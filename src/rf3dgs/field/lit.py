@@ -8,10 +8,11 @@ the transmitter p, cos_i = max(n . w, 0.01), r = 2 (n . w) n - w and v = (q - mu
     ambient = 10^((A + e 10 log10(d / 5 m)) / 10)
     L       = (lit + ambient) 10^(E(v) / 10),  E in -12..12 dB
 
-R, b, alpha, A and e belong to the Gaussian's segment; E is the sum of harmonics of its segment and of its cell and of a
-level of its own. Delay and departure are means of both parts weighted by power, plus a residual F(v) that is made up in
-the same way. Powers are blended through the Gaussians with a depth gate and divided by the accumulated weight, so
-that gaps between Gaussians neither leak nor darken. A picture of a surface has the channels
+R, b, alpha, A and e belong to the Gaussian's segment (a moved field shifts A cell by cell, `field.bounced`); E is the
+sum of harmonics of its segment and of its cell and of a level of its own. Delay and departure are means of both parts
+weighted by power, plus a residual F(v) that is made up in the same way. Powers are blended through the Gaussians with a
+depth gate and divided by the accumulated weight, so that gaps between Gaussians neither leak nor darken, and averaged
+over the instrument's lobe (`field.beam`). A picture of a surface has the channels
 
     0      power over `unit`
     1      accumulated weight sum T alpha
@@ -29,10 +30,12 @@ from torch import Tensor
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import View
 from rf3dgs.core.units import SPEED_OF_LIGHT
+from rf3dgs.field.beam import through_lobe
 from rf3dgs.field.radiance import NANOSECOND, Radiance, bounce
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.splats.compositing import Compositing
 from rf3dgs.splats.harmonics import C0, evaluate, view_directions
+from rf3dgs.splats.raster import Raster
 from rf3dgs.splats.rasterize import Backend, rasterize
 
 Part = Literal["sources", "lit", "ambient"]
@@ -63,6 +66,8 @@ class LitSurface:
     segment_csi `[S, 9, 4]`, cell_csi `[C, 9, 4]`, own_csi `[N, 4]`: the residual F of delay [ns] and departure vector,
         coefficients of degree 2 (middle axis) of the same direction, and a constant.
     tx `[3]`: the transmitter's position [m]. window: in which pictures of the field are drawn; decides nothing else.
+    lobe: half-power width [rad] of the beam through which it is seen; 0 shows each pixel by itself.
+    ambient_shift `[C]`: what is added to A [dB] in each cell, or None for nothing (`field.bounced`).
     """
 
     means: Tensor
@@ -83,6 +88,8 @@ class LitSurface:
     own_csi: Tensor
     tx: Tensor
     window: DbWindow
+    lobe: float = 0.0
+    ambient_shift: Tensor | None = None
 
     def __post_init__(self) -> None:
         count, segments, cells = len(self.means), len(self.laws), len(self.cell_sh)
@@ -104,6 +111,8 @@ class LitSurface:
             "own_csi": (count, 4),
             "tx": (3,),
         }
+        if self.ambient_shift is not None:
+            shapes["ambient_shift"] = (cells,)
         for name, shape in shapes.items():
             got = tuple(getattr(self, name).shape)
             if got != shape:
@@ -144,10 +153,18 @@ class LitSurface:
     def picture(self, view: View, *, csi: bool = True, backend: Backend = "auto") -> Tensor:
         """The channels `[row, col, 2 (+ 4)]` described above, without gradients; `csi=False` gives the first two."""
         with torch.no_grad():
-            values = self.values(view.position, csi=csi)
-            shape = (self.means, self.quats, self._scales, self._opacities)
-            raster = rasterize(*shape, values, view, compositing=BLENDING, backend=backend)
-        return torch.cat((raster.values[..., :1], raster.weight[..., None], raster.values[..., 1:]), -1)
+            raster = self._raster(self.values(view.position, csi=csi), view, backend)
+            shown = through_lobe(raster.values, view, self.lobe)
+        return torch.cat((shown[..., :1], raster.weight[..., None], shown[..., 1:]), -1)
+
+    def seen(self, values: Tensor, view: View, backend: Backend = "auto") -> Tensor:
+        """What the instrument sees `[row, col, channel]` if the Gaussians send `values` `[N, channel]`; differentiable
+        in these."""
+        return through_lobe(self._raster(values, view, backend).values, view, self.lobe)
+
+    def _raster(self, values: Tensor, view: View, backend: Backend) -> Raster:
+        shape = (self.means, self.quats, self._scales, self._opacities)
+        return rasterize(*shape, values, view, compositing=BLENDING, backend=backend)
 
     def radiance(self, channels: Tensor, receiver: Tensor) -> Radiance:
         """Physical values of composited channels `[row, col, 2 (+ 4)]`; zero where no Gaussian is hit."""
@@ -218,7 +235,10 @@ class LitSurface:
     @cached_property
     def _ambient_power(self) -> Tensor:
         law = self.laws[self.segment_of]
-        return 10 ** ((law[:, 3] + law[:, 4] * 10 * torch.log10(self._geometry[0] / AMBIENT_DISTANCE)) / 10)
+        level_db = law[:, 3] + law[:, 4] * 10 * torch.log10(self._geometry[0] / AMBIENT_DISTANCE)
+        if self.ambient_shift is not None:
+            level_db = level_db + self.ambient_shift[self.cell_of]
+        return 10 ** (level_db / 10)
 
     @cached_property
     def _harmonics(self) -> Tensor:

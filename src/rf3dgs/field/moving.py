@@ -10,11 +10,12 @@ from torch import Tensor
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.units import SPEED_OF_LIGHT
+from rf3dgs.field.bounced import bounced, shift_of
 from rf3dgs.field.images import HIGHEST_ORDER, sequences
 from rf3dgs.field.lit import LitSurface
-from rf3dgs.field.radiance import NANOSECOND
+from rf3dgs.field.radiance import bounce
 from rf3dgs.field.sources import PointSources
+from rf3dgs.splats.harmonics import C0
 from rf3dgs.splats.obstacles import Obstacles, visibility_of
 
 if TYPE_CHECKING:
@@ -25,10 +26,8 @@ MOST_PLANES, LARGEST = 40, 6  # largest planes that mirror, and that mirror thre
 LEAST_DB, MOST_SOURCES = 40.0, 200
 OUT_OF_SIGHT = 0.01  # of the usual strongest way: what a probe that only weak ways reach is compared with
 ROWS_AT_ONCE = 400_000
-NEAREST_BOUNCE = 1.0  # m
 UNLIT = 0.1
 LEAST_LIT = 0.05  # of what was lit before
-STRAIGHT = 0.01  # m of detour below which a way is the straight one
 
 
 def moved(field: "RadioField", tx: Pose, *, order: int = 2) -> "RadioField":
@@ -53,7 +52,8 @@ def moved(field: "RadioField", tx: Pose, *, order: int = 2) -> "RadioField":
 
 
 def moved_surface(surface: LitSurface, obstacles: Obstacles, tx: Tensor) -> LitSurface:
-    """The surface lit from `tx` `[3]` [m]: shadows baked anew, the lit laws kept, one ambient level, no residual.
+    """The surface lit from `tx` `[3]` [m]: shadows baked anew, the lit laws kept, no residual, and an
+    ambient level that follows from what is lit now.
 
     `obstacles` are the surface's own Gaussians. Raises InputError when hardly anything is lit from its free side.
     """
@@ -65,48 +65,34 @@ def moved_surface(surface: LitSurface, obstacles: Obstacles, tx: Tensor) -> LitS
             f"tx must stand in the free space of this field; from ({place}) m {lit:.1%} of the surface is lit, from "
             f"where it stood {before:.1%}. Is it in a wall, or outside?"
         )
-    ambient = moved_ambient(surface.means, surface.ambient, surface.tx, tx)
     laws = surface.laws.clone()
-    laws[:, 3], laws[:, 4] = ambient_level_db(surface), 0.0
-    return replace(surface.without_residual(), visibility=visibility, ambient=ambient, laws=laws, tx=tx)
+    laws[:, 3], laws[:, 4] = shared_ambient_db(surface, obstacles), 0.0
+    there = replace(surface.without_residual(), visibility=visibility, laws=laws, tx=tx)
+    got = bounced(there, obstacles)
+    straight = bounce(surface.means, tx)
+    once = got[:, 1:] / got[:, :1].clamp_min(1e-30)
+    ambient = torch.where((got[:, 0] > 0)[surface.cell_of, None], once[surface.cell_of], straight)
+    return replace(there, ambient=ambient, ambient_shift=shift_of(got[:, 0]))
 
 
-def ambient_level_db(surface: LitSurface) -> float:
-    """The median ambient level [dB] of the Gaussians that the transmitter does not light; of all where it lights all.
+def shared_ambient_db(surface: LitSurface, obstacles: Obstacles) -> float:
+    """The ambient level [dB] over what lit surfaces bring each cell: the median over the Gaussians that the transmitter
+    does not light, residual included; over all where it lights all.
 
     Where the transmitter does light, the ambient law takes up what the lit one misses, and its falloff is that of one
     side of a site: neither says anything about another place.
     """
     level_db = 10 * torch.log10(surface.parts(torch.zeros_like(surface.means))[1])
+    constant = surface.segment_sh[surface.segment_of, 0] + surface.cell_sh[surface.cell_of, 0]
+    over_db = level_db + C0 * constant + surface.level - shift_of(bounced(surface, obstacles)[:, 0])[surface.cell_of]
     dark = surface.visibility < UNLIT
-    return float((level_db[dark] if bool(dark.any()) else level_db).median())
+    return float((over_db[dark] if bool(dark.any()) else over_db).median())
 
 
 def _lit(surface: LitSurface, visibility: Tensor, tx: Tensor) -> float:
     """The share of Gaussians that a transmitter lights from their free side."""
     faces = ((tx - surface.means) * surface.normals).sum(-1) > 0
     return float((faces & (visibility > 0.5)).float().mean())
-
-
-def moved_ambient(means: Tensor, ambient: Tensor, old: Tensor, new: Tensor) -> Tensor:
-    """Delay [ns] and departure vector `[N, 4]` of the ambient part for a transmitter at `new` `[3]` [m].
-
-    means `[N, 3]` [m]: the Gaussians; `ambient` is what they get from a transmitter at `old` `[3]`. The place of the
-    one bounce that explains delay and departure stays where it is, and so does the length of the vector.
-    """
-    light = SPEED_OF_LIGHT * NANOSECOND
-    straight = means - old
-    distance = torch.linalg.vector_norm(straight, dim=-1)
-    length = torch.linalg.vector_norm(ambient[:, 1:], dim=-1, keepdim=True)
-    towards = torch.nn.functional.normalize(ambient[:, 1:], dim=-1, eps=1e-9)
-    way = torch.maximum(light * ambient[:, 0], distance)
-    detour = way - (straight * towards).sum(-1)
-    out = (way.square() - distance.square()) / (2 * detour.clamp_min(STRAIGHT))
-    bounce = old + out.clamp_min(NEAREST_BOUNCE)[:, None] * towards
-    bounce = torch.where((detour < STRAIGHT)[:, None], means, bounce)
-    longer = torch.linalg.vector_norm(bounce - new, dim=-1) - torch.linalg.vector_norm(bounce - old, dim=-1)
-    departure = length * torch.nn.functional.normalize(bounce - new, dim=-1, eps=1e-9)
-    return torch.cat((ambient[:, :1] + longer[:, None] / light, departure), -1)
 
 
 def moved_sources(

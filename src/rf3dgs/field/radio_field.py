@@ -18,12 +18,12 @@ from rf3dgs.channel.paths import Paths
 from rf3dgs.core.angles import angles_of
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import DirectionGrid, equirect_grid, list_grid, sample_grid, view_of
+from rf3dgs.core.grids import DirectionGrid, equirect_grid, sample_grid, view_of
 from rf3dgs.field.lit import PARTS, LitSurface, Part
 from rf3dgs.field.radiance import Radiance, Surface
 from rf3dgs.field.rays import FARTHEST_LOBES, Rays
 from rf3dgs.field.sources import PointSources
-from rf3dgs.field.uncertainty import Uncertainty, numbers_of
+from rf3dgs.field.uncertainty import Uncertainty, numbers_of, sizes_of
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
@@ -155,15 +155,12 @@ class RadioField:
         return torch.stack(rows).reshape(*pose.batch_shape, *grid.shape)
 
     def uncertainty_of(self, paths: Paths, *, share: float | None = None) -> Tensor:
-        """How far the levels of this field's `paths` `[*batch, path]` may be off [dB]: `uncertainty` in the direction
-        of each; 0 where a path is not valid."""
+        """How far the levels of this field's `paths` `[*batch, path]` may be off [dB]: half the interval that holds
+        68.3 % of such errors, or `share` of them; 0 where a path is not valid."""
         doubt, flat = self._known_doubt(), paths.rx.flat()
-        aoa = paths.aoa.reshape(len(flat), -1, 3)
-        rows = [
-            self.uncertainty(flat[index], list_grid(flat[index].to_device(aoa[index]))) for index in range(len(flat))
-        ]
-        width = doubt.width(share)
-        return width * torch.cat(rows).reshape(paths.valid.shape) * paths.valid
+        aoa, delay = paths.aoa.reshape(len(flat), -1, 3), paths.delay.reshape(len(flat), -1)
+        rows = [sizes_of(self, doubt, flat[index], aoa[index], delay[index], share) for index in range(len(flat))]
+        return torch.stack(rows).reshape(paths.valid.shape) * paths.valid
 
     def _known_doubt(self) -> Uncertainty:
         if self.doubt is None:
@@ -196,10 +193,10 @@ class RadioField:
     def moved_to(self, tx: Pose, *, order: int = 2) -> "RadioField":
         """The field with its transmitter at `tx`, one pose, without any new measurement; mirror model only.
 
-        Shadows, the lit part's geometry and mirror images up to `order` reflections are computed anew; laws,
-        reflections and the gate's threshold are kept; the residual is dropped. docs/how-to/moving-transmitter.md says
-        what becomes of each part. Raises InputError for a field of the paper's model, and for a place from which no
-        surface is lit.
+        Shadows, the lit part's geometry, ambient light and mirror images up to `order` reflections are computed anew;
+        lit laws, reflections and the gate's threshold are kept; the residual is dropped. What becomes of each part
+        is said in docs/how-to/moving-transmitter.md. Raises InputError for a field of the paper's model, and for a
+        place from which no surface is lit.
         """
         from rf3dgs.field.moving import moved
 

@@ -8,6 +8,7 @@ receiver is decided by geometry: every reflection falls on surface, and every le
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,8 +22,13 @@ from rf3dgs.field.ways import Plan, Ways, ways_over
 from rf3dgs.geometry import Patches, Planes
 from rf3dgs.splats.obstacles import Obstacles
 
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
+
 ROUNDING = 1e-5  # of a cosine in float32
 MARK_PRIOR = 0.05  # weight of no deviation beside marks of weight 1 where they are
+MARK_REACH, NEAREST_MARKS = 5.0, 64  # widths: what is farther, or hidden behind so many nearer ones, weighs nothing
+PLANES_APART = 1e4  # m
 AT_ONCE = 256  # receivers
 
 
@@ -38,23 +44,29 @@ class Marks:
     level_db: Tensor
     width: float
 
-    def at(self, points: np.ndarray, plane: np.ndarray, *, leave_out: bool = False) -> np.ndarray:
-        """What is added at points `[n, 3]` of planes `[n]` [dB]: the mean of near marks, drawn to 0 where few are.
-
-        With `leave_out` the points are those of the marks, and each is told by the others alone.
-        """
-        where, whose, level_db = self._doubles
-        row, mark = np.nonzero(plane[:, None] == whose)
-        if leave_out:
-            row, mark = row[row != mark], mark[row != mark]
-        apart = points[row] - where[mark]
-        weight = np.exp(np.einsum("ni,ni->n", apart, apart) * (-0.5 / self.width**2))
-        total = np.bincount(row, weight, len(points))
-        return np.bincount(row, weight * level_db[mark], len(points)) / (total + MARK_PRIOR)
+    def at(self, points: np.ndarray, plane: np.ndarray) -> np.ndarray:
+        """What is added at points `[n, 3]` of planes `[n]` [dB]: the mean of near marks, drawn to 0 where few are."""
+        tree, level_db = self._tree
+        places = _of_planes(points, plane)
+        apart, mark = tree.query(places, NEAREST_MARKS, distance_upper_bound=MARK_REACH * self.width)
+        weight = np.exp(apart * apart * (-0.5 / self.width**2))  # 0 for those that are missing, infinitely far
+        return (weight * level_db[mark]).sum(-1) / (weight.sum(-1) + MARK_PRIOR)
 
     @cached_property
-    def _doubles(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return self.points.double().numpy(), self.plane.numpy(), self.level_db.double().numpy()
+    def _tree(self) -> "tuple[KDTree, np.ndarray]":
+        """The marks by place and plane, and their levels with a zero behind the last, which stands for none."""
+        from scipy.spatial import KDTree
+
+        tree = KDTree(_of_planes(self.points.double().numpy(), self.plane.numpy()))
+        return tree, np.append(self.level_db.double().numpy(), 0.0)
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in self.__dict__.items() if name != "_tree"}
+
+
+def _of_planes(points: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """Points `[n, 3]` [m] with a fourth coordinate `[n, 4]`, in which planes are far from each other."""
+    return np.concatenate((points, PLANES_APART * plane[:, None]), -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,8 +172,8 @@ class PointSources:
     def transmittance(self, ways: Ways, receivers: np.ndarray, obstacles: Obstacles) -> np.ndarray:
         """Share `[w]` that passes on ways to `receivers` `[n, 3]` [m].
 
-        The geometric mean over the legs of a way, so that a longer way through the same haze is as open; Gaussians of
-        the planes that a leg joins do not stand in its way.
+        That of the leg which lets least pass: one that a column cuts closes the way, however free the others are.
+        Gaussians of the planes that a leg joins do not stand in its way.
         """
         longest = int(self.plan.order.max())
         first = np.broadcast_to(self.plan.chain[0, 0], (len(ways), 1, 3))
@@ -175,8 +187,7 @@ class PointSources:
             skip_start=torch.from_numpy(labels[:, :-1].reshape(-1)) if known else None,
             skip_end=torch.from_numpy(labels[:, 1:].reshape(-1)) if known else None,
         )
-        legs = self.plan.order[ways.source] + 1
-        return passed.numpy().reshape(-1, longest + 1).prod(-1) ** (1 / legs)
+        return passed.numpy().reshape(-1, longest + 1).min(-1)
 
     def rays(self, receiver: Tensor, obstacles: Obstacles, *, within: tuple[Tensor, float] | None = None) -> Rays:
         """What reaches a receiver at `receiver` `[3]` [m].

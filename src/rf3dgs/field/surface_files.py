@@ -20,6 +20,7 @@ HALF = {
 }
 """What is stored in float16, by model."""
 NUMBERS = ("segment_of", "cell_of")
+SHIFT = "ambient_shift"
 LARGEST_LOGIT = 30.0
 
 
@@ -40,6 +41,8 @@ def surface_tensors(surface: Surface | LitSurface) -> dict[str, Tensor]:
         stored["visibility"] = (surface.visibility.clamp(0, 1) * 255).round().to(torch.uint8)
         stored["laws"] = surface.laws.contiguous()
         stored |= {name: getattr(surface, name).to(torch.int32).contiguous() for name in NUMBERS}
+        if surface.ambient_shift is not None:
+            stored[SHIFT] = surface.ambient_shift.contiguous()
     return stored
 
 
@@ -54,7 +57,8 @@ def surface_record(surface: Surface | LitSurface) -> dict[str, Any]:
     }
     if isinstance(surface, LitSurface):
         counts = {"segments": len(surface.laws), "cells": len(surface.cell_sh)}
-        return record | counts | {"csi_coefficients": surface.cell_csi.shape[1]}
+        shifted = {} if surface.ambient_shift is None else {SHIFT: True}
+        return record | counts | shifted | {"csi_coefficients": surface.cell_csi.shape[1], "lobe": surface.lobe}
     return record | {"gain_coefficients": surface.gain_sh.shape[1], "delay_span": surface.delay_span}
 
 
@@ -62,7 +66,7 @@ def surface_kinds(body: Mapping[str, Any]) -> dict[str, tuple[tuple[int, ...], t
     """Shape and type of every tensor of the surface that the description `body` promises.
 
     Descriptions of before there were two models name none; theirs is the paper's. Those of before delay and departure
-    had a residual name no coefficients of it.
+    had a residual name no coefficients of it, those of before surfaces were seen through a lobe no lobe.
     """
     count, model = int(body["gaussians"]), body.get("model", PAPER)
     if model not in HALF:
@@ -103,7 +107,8 @@ def surface_kinds(body: Mapping[str, Any]) -> dict[str, tuple[tuple[int, ...], t
         "level": ((count,), half),
         "ambient": ((count, 4), half),
     }
-    return shape | mirror | (csi if coefficients else {})
+    shift = {SHIFT: ((cells,), torch.float32)} if body.get(SHIFT) else {}
+    return shape | mirror | shift | (csi if coefficients else {})
 
 
 def surface_of(
@@ -128,4 +133,6 @@ def surface_of(
         cell_of=tensors["cell_of"].long(),
         tx=tx,
         window=window,
+        lobe=float(body.get("lobe", 0.0)),
+        ambient_shift=tensors[SHIFT] if body.get(SHIFT) else None,
     )

@@ -6,7 +6,8 @@ Ten numbers of a pixel (`NUMBERS`) give its standard deviation in dB,
 
 with weights w that, but for the first `SIGNED`, only widen, fitted to errors at positions that were left out
 (`training.uncertainty_fit`). Widths of other shares than 68.3 % are multiples of it, counted at the same places: errors
-have longer tails than a normal distribution. See docs/how-to/uncertainty.md.
+have longer tails than a normal distribution. What paths are sure of has a law of its own (`path_uncertainty`). See
+docs/how-to/uncertainty.md.
 """
 
 import math
@@ -20,8 +21,9 @@ from torch import Tensor
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
-from rf3dgs.core.grids import DirectionGrid, equirect_grid, sample_grid, view_of
+from rf3dgs.core.grids import DirectionGrid, equirect_grid, list_grid, sample_grid, view_of
 from rf3dgs.field.lit import BLENDING, LitSurface
+from rf3dgs.field.path_uncertainty import PathDoubt, way_numbers, ways_of
 from rf3dgs.splats.rasterize import rasterize
 
 if TYPE_CHECKING:
@@ -45,7 +47,8 @@ class Uncertainty:
     spread_db `[C]`: root mean square of errors, where nobody had measured, of each cell of the surface. source_db
     `[P + 1]`: of ways over each plane, the straight way last. receivers `[V, 3]` [m]: the training positions. seen
     `[C, V]`: which of them saw a cell. spacing [m]: median distance between neighbours among them. weights `[10]`: of
-    `NUMBERS`. widths `[7]`: of `SHARES`, in standard deviations.
+    `NUMBERS`. widths `[7]`: of `SHARES`, in standard deviations. paths: what is known of point sources; None where
+    there was too little to learn from, and paths are as sure as their direction.
     """
 
     spread_db: Tensor
@@ -55,6 +58,7 @@ class Uncertainty:
     spacing: float
     weights: Tensor
     widths: Tensor
+    paths: PathDoubt | None = None
 
     def __post_init__(self) -> None:
         cells, views = len(self.spread_db), len(self.receivers)
@@ -81,12 +85,14 @@ class Uncertainty:
             return 1.0
         if not 0.0 < share <= SHARES[-1]:
             raise InputError(f"share must lie in (0, {SHARES[-1]}]; got {share}. Further tails were not counted")
-        known = [(0.0, 0.0), *((-math.log1p(-at), float(width)) for at, width in zip(SHARES, self.widths, strict=True))]
-        place = -math.log1p(-share)
-        for (low, below), (high, above) in pairwise(known):
-            if place <= high + 1e-9:
-                return below + (above - below) * (place - low) / (high - low)
-        return known[-1][1]
+        return _between(share, self.widths.tolist())
+
+    def path_level(self, share: float | None) -> float:
+        """The value of the law of paths that holds `share` of the errors, 68.3 % for None."""
+        assert self.paths is not None
+        share = SHARES[ONE_STD] if share is None else share
+        self.width(share)  # which refuses shares that were not counted
+        return -math.expm1(-_between(share, (-torch.log1p(-self.paths.levels.double())).tolist()))
 
     @cached_property
     def typical_db(self) -> float:
@@ -147,6 +153,31 @@ def numbers_of(field: "RadioField", doubt: Uncertainty, pose: Pose, grid: Direct
         (level.max() - level) / 20.0,
     )
     return torch.stack(columns, -1)
+
+
+def sizes_of(
+    field: "RadioField", doubt: Uncertainty, pose: Pose, arrival: Tensor, delay: Tensor, share: float | None
+) -> Tensor:
+    """How far the levels of paths of `arrival` `[k, 3]` and `delay` `[k]` [s] to one `pose` may be off `[k]` [dB]."""
+    numbers = numbers_of(field, doubt, pose, list_grid(pose.to_device(arrival))).reshape(-1, len(NUMBERS))
+    std = doubt.std_db(numbers)
+    size = doubt.width(share) * std
+    if doubt.paths is None or field.sources is None:
+        return size
+    ways, passed, known = ways_of(field, pose.position, arrival, delay)
+    told = way_numbers(field, doubt.paths, ways, passed, std[known], numbers[known, NUMBERS.index("points")])
+    size[known] = doubt.paths.half(doubt.path_level(share), told)
+    return size
+
+
+def _between(share: float, values: list[float]) -> float:
+    """What belongs to a `share`, between `values` that belong to `SHARES`; straight in the logarithm of the rest."""
+    known = [(0.0, 0.0), *((-math.log1p(-at), value) for at, value in zip(SHARES, values, strict=True))]
+    place = -math.log1p(-share)
+    for (low, below), (high, above) in pairwise(known):
+        if place <= high + 1e-9:
+            return below + (above - below) * (place - low) / (high - low)
+    return known[-1][1]
 
 
 def floor_db(surface: LitSurface) -> float:

@@ -7,17 +7,21 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.errors import DataError
+from rf3dgs.field.path_uncertainty import PathDoubt
 from rf3dgs.field.uncertainty import NUMBERS, SHARES, Uncertainty
 
 PREFIX = "doubt_"
+PATHS = PREFIX + "paths_"
 TENSORS = ("spread_db", "source_db", "receivers", "seen", "weights", "widths")
+PATH_TENSORS = ("points", "plane", "off", "wrong", "levels")
 
 
 def doubt_record(doubt: Uncertainty | None) -> dict[str, Any] | None:
     """The numbers as JSON takes them; None for a field that does not know its errors."""
     if doubt is None:
         return None
-    sizes = {"receivers": len(doubt.receivers), "planes": len(doubt.source_db) - 1}
+    points = None if doubt.paths is None else len(doubt.paths.plane)
+    sizes = {"receivers": len(doubt.receivers), "planes": len(doubt.source_db) - 1, "path_points": points}
     return sizes | {"spacing": doubt.spacing, "numbers": list(NUMBERS), "shares": list(SHARES)}
 
 
@@ -25,7 +29,10 @@ def doubt_tensors(doubt: Uncertainty | None) -> dict[str, Tensor]:
     """The tensors by name."""
     if doubt is None:
         return {}
-    return {PREFIX + name: getattr(doubt, name).contiguous() for name in TENSORS}
+    found = {PREFIX + name: getattr(doubt, name).contiguous() for name in TENSORS}
+    if doubt.paths is not None:
+        found |= {PATHS + name: getattr(doubt.paths, name).contiguous() for name in PATH_TENSORS}
+    return found
 
 
 def doubt_kinds(body: Mapping[str, Any]) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
@@ -44,11 +51,22 @@ def doubt_kinds(body: Mapping[str, Any]) -> dict[str, tuple[tuple[int, ...], tor
         "weights": (len(NUMBERS),),
         "widths": (len(SHARES),),
     }
-    return {PREFIX + name: (shape, torch.bool if name == "seen" else torch.float32) for name, shape in shapes.items()}
+    kinds = {PREFIX + name: (shape, torch.bool if name == "seen" else torch.float32) for name, shape in shapes.items()}
+    points = record.get("path_points")
+    if points is not None:
+        count = int(points)
+        of_paths = {"points": (count, 3), "plane": (count,), "off": (2,), "wrong": (3,), "levels": (len(SHARES),)}
+        for name, shape in of_paths.items():
+            kinds[PATHS + name] = (shape, torch.int64 if name == "plane" else torch.float32)
+    return kinds
 
 
 def doubt_of(tensors: Mapping[str, Tensor], record: Mapping[str, Any] | None) -> Uncertainty | None:
     """What was learned, out of checked tensors."""
     if record is None:
         return None
-    return Uncertainty(spacing=float(record["spacing"]), **{name: tensors[PREFIX + name] for name in TENSORS})
+    paths = None
+    if record.get("path_points") is not None:
+        paths = PathDoubt(**{name: tensors[PATHS + name] for name in PATH_TENSORS})
+    known = {name: tensors[PREFIX + name] for name in TENSORS}
+    return Uncertainty(spacing=float(record["spacing"]), paths=paths, **known)

@@ -5,7 +5,7 @@ question and kept; without the core the specification itself answers.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.native import native_core, thread_count
-from rf3dgs.splats.transmittance import segment_transmittance
+from rf3dgs.splats.transmittance import cleared_opacities, segment_transmittance
 
 SOFT_RADIUS = 0.02  # m
 RAYS = 7  # of a soft gate
@@ -87,6 +87,28 @@ class Obstacles:
         threads = 1 if len(start) < FEW else thread_count()
         self._tree.transmittance(_floats(start), _floats(end), *skips, stop_short, passed.numpy(), threads)
         return passed
+
+    def cleared(
+        self,
+        start: Tensor,
+        end: Tensor,
+        *,
+        skip_start: Tensor | None = None,
+        skip_end: Tensor | None = None,
+        stop_short: float = 0.10,
+    ) -> "Obstacles":
+        """The obstacles without what stands in segments that are known to be free; arguments as of `transmittance`.
+
+        Gaussians that a segment meets become fainter, the more the nearer they are to it, until none of them stops
+        more than a twentieth.
+        """
+        start, end = _segments(start, end)
+        first, last = (self._skip(skip, len(start), name) for skip, name in ((skip_start, "start"), (skip_end, "end")))
+        shape = (self.means, self.quats, self.scales, self.opacities)
+        opacities = cleared_opacities(
+            *(*shape, start, end), labels=self.labels, skip_start=first, skip_end=last, stop_short=stop_short
+        )
+        return replace(self, opacities=opacities)
 
     def soft(
         self,

@@ -19,7 +19,7 @@ def calibrate(numbers: Tensor, error_db: Tensor, counts: Tensor, *, signed: int 
     free = torch.ones(x.shape[1], dtype=torch.bool)
     while True:
         weights = torch.zeros(x.shape[1], dtype=torch.float64)
-        weights[free] = _minimum(x[:, free], size, counts)
+        weights[free] = minimum(x[:, free], size, counts)
         negative = weights[signed:] < 0
         if not bool(negative.any()):
             break
@@ -33,7 +33,7 @@ def calibrate(numbers: Tensor, error_db: Tensor, counts: Tensor, *, signed: int 
     return weights.float(), (widths / unit).float()
 
 
-def _minimum(x: Tensor, size: Tensor, counts: Tensor) -> Tensor:
+def minimum(x: Tensor, size: Tensor, counts: Tensor) -> Tensor:
     """The weights `[F]` of `calibrate` without bounds, by damped Newton steps."""
     weights = torch.zeros(x.shape[1], dtype=torch.float64)
     weights[0] = torch.log((counts * size).sum().clamp_min(1e-6))

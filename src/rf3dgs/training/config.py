@@ -22,7 +22,7 @@ class RadioConfig:
     waves crossed and adds what only they know, if the spectra have delay and departure; "given" takes the Gaussians
     as they are, such as those of a mesh that is known."""
     mirror_order: int | None = None
-    """Most reflections of the mirror images that are point sources beside the transmitter, 3 at most; None is 2 with
+    """Most reflections of the mirror images that are point sources beside the transmitter, 3 at most; None is 3 with
     the mirror model and 0, the line of sight alone, with the paper's."""
     array_pictures: Literal["inverted", "face-value"] = "inverted"
     """Spectra taken by an array: "inverted" fits the waves behind the pictures, so that the field shows the ideal lobe;
@@ -34,8 +34,9 @@ class RadioConfig:
     without: tuple[Literal["lit", "ambient", "residual", "visibility"], ...] = ()
     """The mirror model alone: parts that are left out, to see what each brings; without visibility nothing casts a
     shadow and every way is open."""
-    joint: int = 0
-    """The mirror model alone: steps of joint refinement after the closed form, each on one training position."""
+    joint: int | None = None
+    """The mirror model alone: steps of joint refinement of the surface after the closed form, each on one training
+    position; None is 200, 0 leaves the closed form as it is."""
     uncertainty: bool = False
     """The mirror model alone: learn how far its levels may be off, by leaving training positions out in turn. It takes
     about three times as long as the rest."""
@@ -252,6 +253,8 @@ class SourceConfig:
     """Whether walls that the geometry lacks, or has in a wrong place, are found from secondary peaks of the spectra."""
     refine: bool = True
     """Whether planes are moved, within what geometry allows, to where the peaks of their images are."""
+    square: bool = True
+    """Whether small planes that nearly have the direction of a large one take it."""
     plane_error: float = 0.05
     """How far a plane of the geometry may lie off [m], one standard deviation."""
     plane_error_deg: float = 1.0

@@ -3,6 +3,7 @@
 For mirrors a wall is one plane, and none of the Gaussians that stand for it may stand in the way of its own reflection.
 """
 
+import math
 from dataclasses import replace
 
 import torch
@@ -14,6 +15,8 @@ LARGE = 5.0  # m^2
 PIECE_ANGLE = 0.985  # cosine of 10 degrees
 PIECE_DISTANCE = 0.25  # m
 SKIN, SKIN_ANGLE = 0.30, 0.7  # m, cosine of 45 degrees
+SQUARE_ANGLE = math.cos(math.radians(7.0))
+TOGETHER = 0.08  # m
 
 
 def surface_points(planes: Planes, patches: Patches, plane: int) -> Tensor:
@@ -69,3 +72,42 @@ def with_skins(surfaces: Surfaces, means: Tensor) -> Tensor:
         held = surfaces.patches.holds(means[near], torch.full_like(near, plane))
         labels[near[held]] = plane
     return labels
+
+
+def squared(surfaces: Surfaces) -> Surfaces:
+    """The surfaces with small planes along the walls: photographs leave the faces of columns, boards and boxes turned
+    by some degrees, because they are narrow, and such things mostly stand square.
+
+    A plane that is not large and whose normal is within 7 degrees of a large one's takes that direction, about the
+    middle of its surface. Of those that then face one way and lie within 8 cm of each other the smaller become parts of
+    the larger. Planes keep their numbers.
+    """
+    planes, patches = surfaces.planes, surfaces.patches
+    areas, normals, offsets = patches.areas, planes.normals.clone(), planes.offsets.clone()
+    points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
+    walls, whole = normals[areas >= LARGE], torch.arange(len(planes))
+    small = [plane for plane in areas.argsort(descending=True, stable=True).tolist() if 0 < float(areas[plane]) < LARGE]
+    if not len(walls):
+        return surfaces
+    done: list[int] = []
+    for plane in small:
+        cosine = walls @ normals[plane]
+        best = int(cosine.abs().argmax())
+        if float(cosine[best].abs()) < SQUARE_ANGLE:
+            continue
+        normals[plane] = walls[best] * cosine[best].sign()
+        offsets[plane] = (points[plane] @ normals[plane]).median()
+        for other in done:
+            apart = (points[plane] @ normals[other] - offsets[other]).median().abs()
+            if float(normals[other] @ normals[plane]) > PIECE_ANGLE and float(apart) < TOGETHER:
+                points[other], points[plane] = torch.cat((points[other], points[plane])), points[plane][:0]
+                whole[plane] = other
+                break
+        else:
+            done.append(plane)
+    planes = Planes(normals, offsets)
+    flat = [
+        part - (part @ normals[plane] - offsets[plane])[:, None] * normals[plane] for plane, part in enumerate(points)
+    ]
+    plane_of = torch.where(surfaces.plane_of >= 0, whole[surfaces.plane_of.clamp_min(0)], -1)
+    return replace(surfaces, planes=planes, patches=Patches.of(planes, flat, patches.cell), plane_of=plane_of)

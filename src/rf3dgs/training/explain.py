@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import torch
 
 from rf3dgs.core.grids import view_of
-from rf3dgs.field.lit import BLENDING, LitSurface
+from rf3dgs.field.lit import LitSurface
 from rf3dgs.field.rays import Rays
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.spectra.spectrum import Spectrum
-from rf3dgs.splats.rasterize import Backend, rasterize
+from rf3dgs.splats.rasterize import Backend
 
 NAMES = {
     "sources": "power by point sources",
@@ -66,7 +66,6 @@ def explained(
 ) -> Explained:
     """What `surface` and the `rays` of each position explain of `spectra` `[position, row, col]`."""
     area = spectra.grid.solid_angle / spectra.grid.solid_angle.sum()
-    shape = (surface.means, surface.quats, surface.scales, surface.opacities)
     # Each with the residual, but for the first.
     parts = (surface.without_residual(), surface.only("lit"), surface.only("ambient"))
     power, errors = torch.zeros(4, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
@@ -74,9 +73,9 @@ def explained(
         one = spectra[number]
         with torch.no_grad():
             values = torch.cat([part.values(one.pose.position, csi=False) for part in parts], -1)
-            blended = rasterize(*shape, values, view_of(one.pose, one.grid), compositing=BLENDING, backend=backend)
+            shown = surface.seen(values, view_of(one.pose, one.grid), backend)
         points = arriving.picture(one.pose, one.grid, one.instrument)
-        laws, lit, ambient = (blended.values * surface.unit).unbind(-1)
+        laws, lit, ambient = (shown * surface.unit).unbind(-1)
         power += torch.stack([(part.double() * area).sum() for part in (one.power, points, lit, ambient)])
         truth = window.encode(one.power)
         for place, shown in enumerate((points, points + laws, points + lit + ambient)):

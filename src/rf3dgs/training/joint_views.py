@@ -1,19 +1,16 @@
-"""What joint refinement looks at: training spectra as they were measured, the rays that reach them, and how far a
-picture of both is off."""
+"""What joint refinement looks at: training spectra as they were measured, what point sources send into them, and how
+far a picture of both is off."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from rf3dgs.core.grids import View, view_of
-from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.field.radiance import NANOSECOND
 from rf3dgs.field.rays import Rays
-from rf3dgs.field.sources import PointSources
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.training.lit_fit import SOFT_DB
 from rf3dgs.training.lit_views import SOFT_NS, SOFT_TURN
@@ -23,28 +20,19 @@ LEAST_SHARE = 1e-3  # of the floor; where something was measured a picture count
 
 @dataclass(frozen=True, eq=False)
 class JointView:
-    """One training spectrum as it was measured, and what reaches it from point sources.
+    """One training spectrum as it was measured, and what point sources send into it.
 
     view: what it shows. worth `[row, col]`: solid angle of a pixel relative to the picture's mean, zero where nothing
     was measured. truth `[row, col, 1 (+ 4)]`: power over the surface's unit, delay [ns] and departure. floor
-    `[row, col]`: power over the unit up to which levels are all one.
-    place, ray, kernel `[n]`: which pixel sees which of k rays through how much of the beam. free `[k]`: power over the
-    unit in free space. plane, cosine, mark_db `[k, 3]`: its reflections; beyond the last plane is how many there are.
-    known `[k, 1 (+ 4)]`: 1, delay [ns] and departure.
+    `[row, col]`: power over the unit up to which levels are all one. sources `[row, col, 1 (+ 4)]`: power over the unit
+    of point sources, and that times delay [ns] and departure.
     """
 
     view: View
     worth: Tensor
     truth: Tensor
     floor: Tensor
-    place: Tensor
-    ray: Tensor
-    kernel: Tensor
-    free: Tensor
-    plane: Tensor
-    cosine: Tensor
-    mark_db: Tensor
-    known: Tensor
+    sources: Tensor
 
     @property
     def has_csi(self) -> bool:
@@ -52,14 +40,12 @@ class JointView:
         return self.truth.shape[-1] > 1
 
 
-def joint_views(
-    spectra: Spectrum, sources: PointSources, rays: Sequence[Rays], *, unit: float, floor_db: float
-) -> list[JointView]:
-    """The views of `spectra` `[position, row, col]` with the `rays` of `sources`; what is under `floor_db` is one."""
-    return [_view(spectra[number], sources, one, unit, floor_db) for number, one in enumerate(rays)]
+def joint_views(spectra: Spectrum, rays: Sequence[Rays], *, unit: float, floor_db: float) -> list[JointView]:
+    """The views of `spectra` `[position, row, col]` with the `rays` to each; levels under `floor_db` are all one."""
+    return [_view(spectra[number], one, unit, floor_db) for number, one in enumerate(rays)]
 
 
-def _view(one: Spectrum, sources: PointSources, rays: Rays, unit: float, floor_db: float) -> JointView:
+def _view(one: Spectrum, rays: Rays, unit: float, floor_db: float) -> JointView:
     floor = torch.zeros_like(one.power) if one.floor is None else torch.where(one.looked, one.floor, torch.zeros(()))
     told = one.looked & ((one.power > 0) | (floor > 0))
     truth = (one.power / unit)[..., None]
@@ -67,29 +53,14 @@ def _view(one: Spectrum, sources: PointSources, rays: Rays, unit: float, floor_d
     if one.delay is not None and one.aod is not None:
         truth = torch.cat((truth, one.delay[..., None] / NANOSECOND, one.aod), -1)
         known = torch.cat((known, rays.delay[:, None] / NANOSECOND, rays.departure), -1)
-    place, ray, kernel = replace(rays, power=torch.ones_like(rays.power)).shares(one.pose, one.grid, one.instrument)
-    plane = sources.sequence[rays.index]
-    stops = torch.cat((sources.tx.expand(len(rays), 1, 3), rays.points[:, :-1]), 1)
-    normals = torch.cat((sources.planes.normals, torch.zeros(1, 3)))[plane]
-    cosine = (normalize(rays.points - stops, dim=-1) * normals).sum(-1).abs()
-    mark_db = torch.zeros(plane.shape)
-    if sources.marks is not None:
-        met = plane >= 0
-        marked = sources.marks.at(rays.points[met].double().numpy(), plane[met].numpy())
-        mark_db[met] = torch.from_numpy(np.asarray(marked, dtype=np.float32))
+    place, ray, share = rays.shares(one.pose, one.grid, one.instrument)
+    sent = (share / unit)[:, None] * known[ray]
     return JointView(
         view=view_of(one.pose, one.grid),
         worth=one.grid.solid_angle / one.grid.solid_angle.mean() * told,
         truth=truth,
         floor=(floor / unit).clamp_min(10 ** (floor_db / 10) / unit),
-        place=place,
-        ray=ray,
-        kernel=kernel,
-        free=friis_gain(rays.delay * SPEED_OF_LIGHT, sources.frequency) / unit,
-        plane=torch.where(plane >= 0, plane, len(sources.planes)),
-        cosine=cosine,
-        mark_db=mark_db,
-        known=known,
+        sources=torch.zeros_like(truth).flatten(0, 1).index_add(0, place, sent).reshape(truth.shape),
     )
 
 

@@ -1,22 +1,21 @@
-"""The surface part of the mirror model in closed form: laws of segments, then a residual from coarse to fine.
+"""The surface part of the mirror model in closed form: laws of segments, and the ambient part's delay and departure.
 
 The laws R, b, alpha, A, e of all segments are found together by Gauss-Newton steps on a soft-L1 loss in dB, first one
 law for everything, then each segment's own, drawn to the common one as if that had been seen in `SHRINK` pixels. What
-remains is a linear problem in dB: harmonics of segments and cells and a level for each Gaussian, by ridge regression.
+remains is the residual's (`training.residual`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from rf3dgs.core.units import SPEED_OF_LIGHT
-from rf3dgs.field.lit import AMBIENT_DISTANCE, CSI_HARMONICS, HARMONICS, LARGEST_RESIDUAL_DB, LitSurface, incidence
+from rf3dgs.field.lit import AMBIENT_DISTANCE, incidence
 from rf3dgs.field.radiance import NANOSECOND, bounce
-from rf3dgs.splats.harmonics import C0, basis, view_directions
-from rf3dgs.splats.rasterize import Backend
-from rf3dgs.training.lit_views import LitView, Observations, Shortfall, shortfall
+from rf3dgs.splats.harmonics import view_directions
+from rf3dgs.training.lit_views import Observations
 
 SOFT_DB = 3.0  # where soft-L1 turns from squares to absolute values
 SHRINK = 30.0  # [pixel]
@@ -30,7 +29,6 @@ AMBIENT_ROUNDS = 3
 DARK = 1e-4  # visibility below which nothing arrives straight
 DB = 10 / 2.302585092994046
 MOST = 400_000
-ROWS_AT_ONCE = 50_000
 BAND = torch.tensor([degree for degree in range(4) for _ in range(2 * degree + 1)], dtype=torch.float32)
 
 
@@ -61,7 +59,7 @@ class Scattering:
 def fit_laws(scattering: Scattering, seen: Observations, without: Sequence[str] = ()) -> Tensor:
     """The laws `[S, 5]` of all segments, "lit" or "ambient" part `without` which the rest is fitted."""
     chosen = _some(len(seen), MOST)
-    g, weight = seen.gaussian[chosen], _worth(seen.weight[chosen])
+    g, weight = seen.gaussian[chosen], worth(seen.weight[chosen])
     level = seen.level_db[chosen]
     along = view_directions(scattering.means[g] - seen.receivers[seen.view[chosen]], torch.zeros(3))
     known = _known(scattering, g, along)
@@ -77,7 +75,10 @@ def fit_laws(scattering: Scattering, seen: Observations, without: Sequence[str] 
     if "lit" in without and "ambient" in without:
         return start.expand(count, -1).clone()
     common = _refine(start, start, 0.0, everyone, known, level, weight)
-    return _refine(common.expand(count, -1).clone(), common, SHRINK, segment, known, level, weight)
+    laws = _refine(common.expand(count, -1).clone(), common, SHRINK, segment, known, level, weight)
+    if "ambient" in without:  # nothing tells how fast what is not there falls off
+        laws[:, 3], laws[:, 4] = OFF_DB, 0.0
+    return laws
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,110 +157,6 @@ def _refine(
     return laws
 
 
-@dataclass(frozen=True)
-class Ridge:
-    """How strongly each level of the residual is drawn to zero, in pixels that say so."""
-
-    segment: float = 30.0
-    cell: float = 30.0
-    level: float = 2.0
-
-
-RIDGE = Ridge()
-CSI_RIDGE = Ridge(segment=5.0, cell=5.0, level=2.0)
-
-
-def refine_residual(
-    surface: LitSurface,
-    views: Sequence[LitView],
-    *,
-    passes: int,
-    floor_db: float,
-    ridge: Ridge = RIDGE,
-    backend: Backend = "auto",
-) -> LitSurface:
-    """The surface with the residual that makes up for what it lacks in `views`, in so many passes.
-
-    Each pass renders the views, throws their errors in dB back onto the Gaussians, and solves for what is lacking from
-    coarse to fine: harmonics of segments, harmonics of cells, levels. Levels under `floor_db` count as that.
-    """
-    for _ in range(passes):
-        lacking = shortfall(surface, views, floor_db, backend)
-        surface = _corrected(surface, views, lacking, ridge)
-    return surface
-
-
-def _corrected(surface: LitSurface, views: Sequence[LitView], lacking: Shortfall, ridge: Ridge) -> LitSurface:
-    receivers = torch.stack([one.view.position for one in views])
-    along = view_directions(surface.means[lacking.gaussian] - receivers[lacking.view], torch.zeros(3))
-    harmonics, weight = basis(along, 3), _worth(lacking.weight)
-    left_over = lacking.error_db
-    penalty = C0**2 * torch.diag((1.0 + BAND) ** 2)
-    found = []
-    for group, groups, strength in (
-        (surface.segment_of, len(surface.laws), ridge.segment),
-        (surface.cell_of, len(surface.cell_sh), ridge.cell),
-    ):
-        number = group[lacking.gaussian]
-        left, right = torch.zeros(groups, HARMONICS**2), torch.zeros(groups, HARMONICS)
-        for part in torch.arange(len(lacking)).split(ROWS_AT_ONCE):
-            weighted = harmonics[part] * weight[part, None]
-            products = weighted[:, :, None] * harmonics[part][:, None, :]
-            left.index_add_(0, number[part], products.reshape(len(part), -1))
-            right.index_add_(0, number[part], weighted * left_over[part, None])
-        correction = torch.linalg.solve(left.reshape(groups, HARMONICS, HARMONICS) + strength * penalty, right)
-        left_over = left_over - (harmonics * correction[number]).sum(-1)
-        found.append(correction)
-    total = torch.zeros(len(surface)).index_add_(0, lacking.gaussian, weight)
-    own = torch.zeros(len(surface)).index_add_(0, lacking.gaussian, weight * left_over) / (total + ridge.level)
-    level = (surface.level + own).clamp(-LARGEST_RESIDUAL_DB, LARGEST_RESIDUAL_DB)
-    surface = replace(
-        surface, segment_sh=surface.segment_sh + found[0], cell_sh=surface.cell_sh + found[1], level=level
-    )
-    if lacking.csi_weight is None or lacking.csi_error is None:
-        return surface
-    parts = [
-        _csi_corrected(surface, lacking.gaussian, harmonics[:, :CSI_HARMONICS], weight, error, CSI_RIDGE)
-        for weight, error in (
-            (lacking.csi_weight[:, 0], lacking.csi_error[:, :1]),
-            (lacking.csi_weight[:, 1], lacking.csi_error[:, 1:]),
-        )
-    ]
-    segment, cell, own = (torch.cat(part, -1) for part in zip(*parts, strict=True))
-    return replace(
-        surface,
-        segment_csi=surface.segment_csi + segment,
-        cell_csi=surface.cell_csi + cell,
-        own_csi=surface.own_csi + own,
-    )
-
-
-def _csi_corrected(
-    surface: LitSurface, gaussian: Tensor, harmonics: Tensor, weight: Tensor, error: Tensor, ridge: Ridge
-) -> tuple[Tensor, Tensor, Tensor]:
-    """What delay or departure lacks: coefficients `[S, K, c]` of segments, `[C, K, c]` of cells, constants `[N, c]`."""
-    weight = _worth(weight)
-    columns, channels = harmonics.shape[1], error.shape[1]
-    penalty = C0**2 * torch.diag((1.0 + BAND[:columns]) ** 2)
-    left_over, found = error, []
-    for group, groups, strength in (
-        (surface.segment_of, len(surface.laws), ridge.segment),
-        (surface.cell_of, len(surface.cell_sh), ridge.cell),
-    ):
-        number = group[gaussian]
-        weighted = harmonics * weight[:, None]
-        left, right = torch.zeros(groups, columns**2), torch.zeros(groups, columns * channels)
-        left.index_add_(0, number, (weighted[:, :, None] * harmonics[:, None, :]).flatten(1))
-        right.index_add_(0, number, (weighted[:, :, None] * left_over[:, None, :]).flatten(1))
-        left = left.reshape(groups, columns, columns) + strength * penalty
-        correction = torch.linalg.solve(left, right.reshape(groups, columns, channels))
-        left_over = left_over - (harmonics[:, :, None] * correction[number]).sum(1)
-        found.append(correction)
-    total = torch.zeros(len(surface)).index_add_(0, gaussian, weight)
-    own = torch.zeros(len(surface), channels).index_add_(0, gaussian, weight[:, None] * left_over)
-    return found[0], found[1], own / (total + ridge.level)[:, None]
-
-
 def fit_ambient(scattering: Scattering, seen: Observations, laws: Tensor, ridge: float = 1.0) -> Tensor:
     """Delay [ns] up to the Gaussian and departure vector `[N, 4]` of the ambient part: what is left of the observed
     means when the lit part's own are taken out, segment, cell, then Gaussian."""
@@ -275,7 +172,7 @@ def fit_ambient(scattering: Scattering, seen: Observations, laws: Tensor, ridge:
     own = seen.csi.clone()
     own[:, 0] -= late / (SPEED_OF_LIGHT * NANOSECOND)
     straight = start[g]
-    weight = _worth(seen.weight)
+    weight = worth(seen.weight)
     groups = (scattering.segment_of, scattering.cell_of, torch.arange(count))
     total = torch.zeros(count, 4)
     for _ in range(AMBIENT_ROUNDS):
@@ -297,7 +194,7 @@ def _along(scattering: Scattering, seen: Observations) -> Tensor:
     return view_directions(scattering.means[seen.gaussian] - seen.receivers[seen.view], torch.zeros(3))
 
 
-def _worth(weight: Tensor) -> Tensor:
+def worth(weight: Tensor) -> Tensor:
     """What an observation counts: its pixels, at most a few, since neighbours in a picture are not independent."""
     return weight / (1 + 0.25 * weight)
 

@@ -24,6 +24,7 @@ from rf3dgs.training.radio_views import ruled
 LEAST_WEIGHT = 0.02  # [pixel]; what a view tells of fainter Gaussians is left out
 LEAST_POWER = 1e-30
 FARTHEST_DB = 15.0  # errors of pixels beyond this count as this
+SHARP_DB = 6.0  # where errors of pixels turn from squares to absolute values: one in ten is an edge or a mirror path
 SOFT_NS, SOFT_TURN = 1.0, 0.1  # errors of delay [ns] and departure [rad] that count as squares; absolutely beyond
 
 
@@ -71,7 +72,7 @@ class Shortfall:
     times the Gaussian's share in their power; error_db `[M]`: mean of truth over model, weighted so.
 
     csi_weight `[M, 2]`, csi_error `[M, 4]`: the same of delay [ns] and of the departure vector, or None. Pixels of
-    large errors count less there, so that what is fitted are medians rather than means.
+    large errors count less, so that what is fitted are medians rather than means, the more so for the latter.
     """
 
     gaussian: Tensor
@@ -145,7 +146,6 @@ def shortfall(surface: LitSurface, views: Sequence[LitView], floor_db: float, ba
     The share is the derivative of a pixel's level in a Gaussian's. Levels under `floor_db`, or a pixel's own floor,
     count as that.
     """
-    shape = (surface.means, surface.quats, surface.scales, surface.opacities)
     has_csi = all(view.channels.shape[-1] == 5 for view in views)
     rows = []
     for number, one in enumerate(views):
@@ -155,9 +155,9 @@ def shortfall(surface: LitSurface, views: Sequence[LitView], floor_db: float, ba
             # The weights do not depend on what is blended: channels beyond the model's own bring back more sums.
             values = torch.cat((values, sent.expand(-1, 3 if has_csi else 1)), -1).requires_grad_()
         with torch.enable_grad():
-            raster = rasterize(*shape, values, one.view, compositing=BLENDING, backend=backend)
-            upstream = _lacking(raster.values.detach(), one, surface.unit, floor_db)
-            (sums,) = torch.autograd.grad(raster.values, values, upstream)
+            shown = surface.seen(values, one.view, backend)
+            upstream = _lacking(shown.detach(), one, surface.unit, floor_db)
+            (sums,) = torch.autograd.grad(shown, values, upstream)
         sums = sums * sent
         chosen = (sums[:, 0] > LEAST_WEIGHT).nonzero().squeeze(-1)
         rows.append((chosen, torch.full_like(chosen, number), sums[chosen]))
@@ -171,15 +171,16 @@ def shortfall(surface: LitSurface, views: Sequence[LitView], floor_db: float, ba
 
 
 def _lacking(shown: Tensor, one: LitView, unit: float, floor_db: float) -> Tensor:
-    """Per unit of a Gaussian's weight `[row, col, 2 or 8]`: its share in a pixel, and that times the error in dB; its
-    robust share and that times the error in delay; and in departure."""
+    """Per unit of a Gaussian's weight `[row, col, 2 or 8]`: its robust share in a pixel, and that times the error in
+    dB; and likewise of the delay; and of the departure."""
     power = shown[..., 0]
     floor = (one.floor / unit).float().clamp_min(10 ** (floor_db / 10) / unit)
     truth = (one.channels[..., 0] / unit).float()
     error = 10 * torch.log10(torch.maximum(truth, floor) / torch.maximum(power, floor))
     some = torch.where(power > 0, power, 1.0)
     share = one.keep * (power > 0) / some
-    level = (share, share * error.clamp(-FARTHEST_DB, FARTHEST_DB))
+    near = share / (1 + (error / SHARP_DB).square()).sqrt()
+    level = (near, near * error.clamp(-FARTHEST_DB, FARTHEST_DB))
     if one.channels.shape[-1] == 1:
         return torch.stack(level, -1)
     reached = share * (truth >= floor) * (one.channels[..., 0] > one.floor)

@@ -1,8 +1,8 @@
 """The mirror model's radio stage: spectra and frozen geometry to a `RadioField` whose parts are laws of physics.
 
 Closed form: surfaces of the geometry, point sources (the transmitter and its mirror images), and then the surface part
-on what the point sources leave over; if it is asked for, both are then refined together. The same spectra and geometry
-give the same field.
+on what the point sources leave over, which is then refined in one picture with them. The same spectra, geometry and
+seed give the same field.
 """
 
 from dataclasses import replace
@@ -22,15 +22,16 @@ from rf3dgs.splats.obstacles import Obstacles, visibility_of
 from rf3dgs.training.config import RadioConfig, SourceConfig
 from rf3dgs.training.explain import explained
 from rf3dgs.training.joint import refine_jointly
-from rf3dgs.training.lit_fit import Scattering, fit_ambient, fit_laws, refine_residual
+from rf3dgs.training.lit_fit import Scattering, fit_ambient, fit_laws
 from rf3dgs.training.lit_views import LitView, lit_views, observe
+from rf3dgs.training.residual import PASSES, refine_residual
 from rf3dgs.training.source_fit import fit_sources
 
 CELL = 4  # cells of the patches: 0.4 m unless Gaussians are large
-PASSES = 3
-MIRROR_ORDER = 2  # unless the configuration says otherwise
+MIRROR_ORDER = 3  # unless the configuration says otherwise
+JOINT = 200  # steps, likewise
 DEEPEST_DB = 90.0  # under the window's ceiling; what is darker is the tail of a beam, or directions that no ray reached
-STAGES = ("surfaces", "point sources", "observations", "laws", "residual")
+STAGES = ("surfaces", "point sources", "observations", "laws", "residual", "joint refinement")
 
 
 def fit_mirror(
@@ -57,31 +58,34 @@ def fit_mirror(
         solidity = torch.zeros_like(solidity)
     obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, solidity, surfaces.plane_of)
     order = MIRROR_ORDER if config.mirror_order is None else config.mirror_order
-    found = fit_sources(spectra, surfaces, obstacles, tx, SourceConfig(order=order, seed=config.seed))
+    mirrors = SourceConfig(order=order, seed=config.seed)
+    found = fit_sources(spectra, surfaces, obstacles, tx, mirrors, geometry=geometry)
     progress.update(2)
     views = lit_views(spectra, found.rays)
-    surface = fit_surface(geometry, surfaces, obstacles, views, tx.position, window, config, progress)
-    sources, rays = found.sources, found.rays
-    if config.joint:
-        surface, sources = refine_jointly(
+    obstacles = replace(obstacles, opacities=found.obstacles.opacities)
+    surface = fit_surface(
+        geometry, surfaces, obstacles, views, tx.position, window, spectra.instrument.lobe, config, progress
+    )
+    steps = JOINT if config.joint is None else config.joint
+    if steps:
+        surface = refine_jointly(
             surface,
-            sources,
-            rays,
+            found.rays,
             spectra,
-            steps=config.joint,
+            steps=steps,
             seed=config.seed,
             floor_db=_floored(window).floor_db,
             residual="residual" not in config.without,
             backend=config.backend,
         )
-        rays = sources.rays_each(positions, replace(obstacles, labels=found.plane_of), in_sight=found.seen)
-    parts = explained(surface, rays, spectra, _floored(window), config.backend)
+    progress.update(6)
+    parts = explained(surface, found.rays, spectra, _floored(window), config.backend)
     progress.finish()
     return RadioField(
         surface=surface,
-        sources=sources,
-        plane_of=found.plane_of,
-        solidity=solidity,
+        sources=found.sources,
+        plane_of=found.obstacles.labels,
+        solidity=found.obstacles.opacities,
         frequency=spectra.frequency,
         instrument=spectra.instrument,
         tx=tx,
@@ -99,10 +103,11 @@ def fit_surface(
     views: list[LitView],
     tx: Tensor,
     window: DbWindow,
+    lobe: float,
     config: RadioConfig,
     progress: Progress,
 ) -> LitSurface:
-    """The surface part of the model, fitted to `views`, in which point sources are already taken out."""
+    """The surface part of the model, fitted to `views` through a `lobe` [rad], in which point sources are taken out."""
     visibility = visibility_of(obstacles, geometry.means, surfaces.normals, tx, surfaces.plane_of)
     cells = cells_of(geometry.means, surfaces.segment_of, CELL * surfaces.patches.cell)
     scattering = Scattering.of(geometry.means, surfaces.normals, visibility, surfaces.segment_of, cells, tx)
@@ -131,6 +136,7 @@ def fit_surface(
         own_csi=torch.zeros(len(geometry), 4),
         tx=tx,
         window=window,
+        lobe=lobe,
     )
     passes = 0 if "residual" in config.without else PASSES
     surface = refine_residual(bare, views, passes=passes, floor_db=floor_db, backend=config.backend)

@@ -68,7 +68,7 @@ def fit_radio(
         )
     if config.uncertainty and config.model != "mirror":
         raise InputError('uncertainty belongs to the mirror model; choose model="mirror" or leave it out')
-    if config.joint < 0 or (config.joint and config.model != "mirror"):
+    if config.joint is not None and (config.joint < 0 or config.model != "mirror"):
         raise InputError(
             f"joint counts steps of the mirror model's joint refinement, 0 or more; got {config.joint} with the model "
             f"{config.model!r}. Leave it out"
@@ -150,8 +150,8 @@ def fit_radio(
     return RadioField(
         surface=stage.surface(),
         sources=None if found is None else found.sources,
-        plane_of=None if found is None else found.plane_of,
-        solidity=geometry.opacities.detach(),
+        plane_of=None if found is None else found.obstacles.labels,
+        solidity=geometry.opacities.detach() if found is None else found.obstacles.opacities,
         frequency=spectra.frequency,
         instrument=spectra.instrument,
         tx=where,

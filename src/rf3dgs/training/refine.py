@@ -8,10 +8,10 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.field.lit import LitSurface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.spectra.spectrum import Spectrum
-from rf3dgs.training.lit_fit import refine_residual
 from rf3dgs.training.lit_views import lit_views
-from rf3dgs.training.mirror import DEEPEST_DB, PASSES
+from rf3dgs.training.mirror import DEEPEST_DB
 from rf3dgs.training.radio import check_spectra
+from rf3dgs.training.residual import refine_residual
 
 SAME_PLACE = 0.05  # m
 
@@ -43,5 +43,5 @@ def refine_field(field: RadioField, spectra: Spectrum) -> RadioField:
     window = field.window
     floor_db = max(window.floor_db, window.ceil_db - DEEPEST_DB)
     views = lit_views(spectra, rays)
-    refined = refine_residual(surface, views, passes=PASSES, floor_db=floor_db, backend=field.backend)
+    refined = refine_residual(surface, views, floor_db=floor_db, backend=field.backend)
     return replace(field, surface=refined, meta=field.meta | {"refined by positions": len(spectra)})

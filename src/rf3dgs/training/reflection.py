@@ -1,15 +1,16 @@
 """How much each plane reflects, from how far the images' peaks stand out of their surroundings."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
 from rf3dgs.core.angles import angle_between
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
+from rf3dgs.field.images import HIGHEST_ORDER
 from rf3dgs.field.rays import Rays
-from rf3dgs.field.sources import Marks, PointSources
+from rf3dgs.field.sources import PointSources
 from rf3dgs.field.transmitter import pixel_of
 from rf3dgs.spectra.spectrum import Spectrum
 
@@ -20,22 +21,20 @@ ROUNDS = 30
 COMMON = (10.0, 10.0, 10.0)  # dB by which a, b and c of one plane may differ from the common ones
 LOOSE = (30.0, 30.0, 30.0)  # and the common ones from DIELECTRIC
 DIELECTRIC = (-6.0, -6.0, 0.0)
-WIDTHS = (0.3, 0.5, 0.8)  # of marks [m]
-LEAST_MARKS = 6
-DOUBTFUL_DB = 6.0
-WORTH_DB = 0.4
-MOST_DB = 25.0
 SILENT_SHARE, SILENT_LEAST = 0.3, 3
+DUE_DB = 3.0  # over what a peak must exceed to be seen
+LATE = 1e-9  # s; a wall that stands 10 cm off delays its reflection by less
 
 
 @dataclass(frozen=True, eq=False)
 class Glints:
-    """What was measured in the directions of images of order 1: n observations.
+    """What was measured in the directions of images: n observations.
 
-    position, source, plane `[n]`: which. point `[n, 3]`: where the reflection is [m]. cosine `[n]` of incidence.
-    level_db `[n]`: 10 log10 of what stands out over Friis and the sources' level. limit_db `[n]`: the level of the
-    surroundings in the same measure. seen `[n]`: the peak stands 3 dB over its surroundings. alone `[n]`: no other ray
-    arrives beside it.
+    position, source `[n]`: which. plane `[n, 3]`: the mirrors from the transmitter on, -1 beyond the last. point
+    `[n, 3, 3]`: where the reflections are [m]. cosine `[n, 3]` of incidence. level_db `[n]`: 10 log10 of what stands
+    out over Friis and the sources' level. limit_db `[n]`: what in the same measure a peak must exceed to be seen: the
+    level of the surroundings, or of another wave that arrives there. seen `[n]`: the peak stands 3 dB over its
+    surroundings, and at the time of its way where the spectra have delays. alone `[n]`: no other ray arrives beside it.
     """
 
     position: Tensor
@@ -51,10 +50,19 @@ class Glints:
     def __len__(self) -> int:
         return len(self.position)
 
+    @property
+    def order(self) -> Tensor:
+        """Number of reflections `[n]`."""
+        return (self.plane >= 0).sum(-1)
+
+    def only(self, chosen: Tensor) -> "Glints":
+        """Some of them, by a mask or list."""
+        return Glints(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
 
 def glints(sources: PointSources, rays: list[Rays], spectra: Spectrum) -> Glints:
-    """The observations of all rays of order 1 at the positions of `spectra` `[position, row, col]`."""
-    rows, points = [], [torch.zeros(0, 3)]
+    """The observations of all rays that were reflected at the positions of `spectra` `[position, row, col]`."""
+    parts = []
     for position, one in enumerate(rays):
         if not len(one):
             continue
@@ -63,23 +71,42 @@ def glints(sources: PointSources, rays: list[Rays], spectra: Spectrum) -> Glints
         free = friis_gain(one.delay * SPEED_OF_LIGHT, sources.frequency) * 10 ** (sources.level_db / 10)
         apart = angle_between(one.arrival[:, None], one.arrival[None]) + torch.pi * torch.eye(len(one))
         lobes = torch.where(one.order == 0, APART_FROM_SIGHT, APART_LOBES)
-        crowded = (apart < lobes * spectrum.instrument.lobe) & (power > 0.25 * power[:, None])
-        for ray in torch.nonzero((one.order == 1) & torch.isfinite(ring)).squeeze(-1).tolist():
-            plane = int(sources.sequence[one.index[ray], 0])
-            leg = torch.nn.functional.normalize(one.points[ray, 0] - sources.tx, dim=-1)
-            cosine = float((leg * sources.planes.normals[plane]).sum().abs())
-            level, limit = float(power[ray] / free[ray]), float(ring[ray] / free[ray])
-            seen, alone = level > limit, not bool(crowded[ray].any())
-            points.append(one.points[ray, :1])
-            rows.append((position, int(one.index[ray]), plane, cosine, level, limit, seen, alone))
-    table = torch.tensor([[float(value) for value in row] for row in rows], dtype=torch.float64).reshape(-1, 8)
-    position, source, plane, cosine, level, limit, seen, alone = table.unbind(-1)
+        crowded = ((apart < lobes * spectrum.instrument.lobe) & (power > 0.25 * power[:, None])).any(-1)
+        timely = on_time(spectrum, one)
+        limit = torch.where(timely, ring, torch.maximum(power, ring))
+        kept = (one.order > 0) & torch.isfinite(ring)
+        plane = sources.sequence[one.index]
+        stops = torch.cat((sources.tx.expand(len(one), 1, 3), one.points), 1)
+        legs = torch.nn.functional.normalize(stops[:, 1:] - stops[:, :-1], dim=-1)
+        cosine = (legs * sources.planes.normals[plane.clamp_min(0)]).sum(-1).abs().double()
+        columns = (torch.full_like(one.index, position), one.index, plane, one.points, cosine)
+        levels = (_decibels(power / free), _decibels(limit / free), (power > ring) & timely, ~crowded)
+        parts.append([column[kept] for column in (*columns, *levels)])
+    if not parts:
+        none, count = torch.zeros(0), torch.zeros(0, dtype=torch.long)
+        rows, level = torch.zeros(0, 3), torch.zeros(0, dtype=torch.float64)
+        return Glints(count, count, rows.long(), torch.zeros(0, 3, 3), rows.double(), level, level, none > 0, none > 0)
+    return Glints(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
-    def decibels(value: Tensor) -> Tensor:
-        return 10 * torch.log10(value.clamp_min(1e-12))
 
-    numbers = (position.long(), source.long(), plane.long(), torch.cat(points), cosine)
-    return Glints(*numbers, decibels(level), decibels(limit), seen > 0, alone > 0)
+def _decibels(value: Tensor) -> Tensor:
+    return 10 * torch.log10(value.double().clamp_min(1e-12))
+
+
+def on_time(one: Spectrum, rays: Rays) -> Tensor:
+    """True `[k]` for rays at whose arrival a spectrum `[row, col]` has the delay of their way, within `LATE`.
+
+    The delay there is the mean over half a lobe, weighted by power. Spectra without delays contradict no ray.
+    """
+    if one.delay is None:
+        return torch.ones(len(rays), dtype=torch.bool)
+    reach = max(0.5 * one.instrument.lobe, 0.75 * pixel_of(one))
+    cosine = rays.arrival @ one.directions.reshape(-1, 3).mT
+    pixel = torch.nonzero((cosine > math.cos(2 * reach)).any(0)).squeeze(-1)
+    angle = torch.acos(cosine[:, pixel].clamp(-1, 1))
+    weight = torch.where(angle < reach, one.heard.reshape(-1)[pixel] * one.instrument.kernel(angle), 0.0)
+    total = weight.sum(-1).clamp_min(1e-30)
+    return ((weight @ one.delay.reshape(-1)[pixel]) / total - rays.delay).abs() < LATE
 
 
 def ray_powers(one: Spectrum, arrival: Tensor) -> tuple[Tensor, Tensor]:
@@ -128,65 +155,64 @@ def ray_powers(one: Spectrum, arrival: Tensor) -> tuple[Tensor, Tensor]:
 def fit_reflection(found: Glints, count: int) -> Tensor:
     """a, b and c `[count, 3]` of 10 log10 Gamma = a + b cos + c cos^2 of each plane, from isolated peaks.
 
-    Huber's regression in dB, in which a peak that is not seen says only that it is weaker than its surroundings. Planes
-    are drawn to common values, so that one of few observations keeps near them.
+    Huber's regression in dB, in which the reflections of a way add up. A peak of one reflection that is not seen says
+    only that it is weaker than its surroundings; of more, nothing. Planes are drawn to common values, so that one of
+    few observations keeps near them.
     """
-    use = found.alone
-    plane, cosine = found.plane[use], found.cosine[use]
-    seen, level, limit = found.seen[use], found.level_db[use], found.limit_db[use]
-    design = torch.stack((torch.ones_like(cosine), cosine, cosine * cosine), -1)
-    common = torch.tensor(DIELECTRIC, dtype=torch.float64)
-    own = common.repeat(count, 1)
-    if not len(plane):
-        return own.float()
+    start = torch.tensor(DIELECTRIC, dtype=torch.float64)
+    used = found.only(found.alone & (found.seen | (found.order == 1)))
+    if not len(used):
+        return start.repeat(count, 1).float()
+    design = _design(used, count)
+    common, own = start, start.repeat(count, 1)
+    heard = torch.zeros(count, dtype=torch.bool).index_fill(0, used.plane[used.plane >= 0], True)
     stiff = 1 / torch.tensor(COMMON, dtype=torch.float64) ** 2
     loose = 1 / torch.tensor(LOOSE, dtype=torch.float64) ** 2
     for _ in range(ROUNDS):
-        predicted = (design * own[plane]).sum(-1)
-        target = torch.where(seen, level, torch.minimum(limit, predicted))
+        predicted = design @ own.reshape(-1)
+        target = torch.where(used.seen, used.level_db, torch.minimum(used.limit_db, predicted))
         miss = target - predicted
-        weight = (HUBER_DB / miss.abs().clamp_min(HUBER_DB)) / HUBER_DB**2
-        weighted = design * weight[:, None]
-        left = torch.zeros(count, 3, 3, dtype=torch.float64)
-        left.index_add_(0, plane, weighted[:, :, None] * design[:, None, :])
-        right = torch.zeros(count, 3, dtype=torch.float64).index_add_(0, plane, weighted * target[:, None])
-        own = torch.linalg.solve(left + torch.diag(stiff), right + stiff * common)
-        heard = torch.bincount(plane, minlength=count) > 0
-        start = torch.tensor(DIELECTRIC, dtype=torch.float64)
+        weight = (HUBER_DB / miss.abs().clamp_min(HUBER_DB)) / (HUBER_DB * used.order) ** 2
+        left = design.mT @ (weight[:, None] * design) + torch.diag(stiff.repeat(count))
+        right = design.mT @ (weight * target) + (stiff * common).repeat(count)
+        own = torch.linalg.solve(left, right).reshape(count, 3)
         common = (stiff * own[heard].sum(0) + loose * start) / (stiff * int(heard.sum()) + loose)
     return own.clamp(-200, 200).float()
 
 
-def fit_marks(found: Glints, reflection: Tensor) -> Marks | None:
-    """Where planes reflect otherwise than `reflection` `[P, 3]` says, or None where that predicts no plane better.
-
-    Every isolated peak marks the place of its reflection with what it deviates, but for deep losses that hardly stand
-    over their surroundings. A plane has marks if each is told better by the others of the plane than by none; the
-    width is the one that tells them best.
-    """
-    design = torch.stack((torch.ones_like(found.cosine), found.cosine, found.cosine**2), -1)
-    predicted = (design * reflection[found.plane].double()).sum(-1).clamp_max(0.0)
-    miss = found.level_db - predicted
-    doubtful = (miss < -DOUBTFUL_DB) & (found.level_db < found.limit_db + DOUBTFUL_DB)
-    use = found.alone & found.seen & ~doubtful
-    points, plane, level_db = found.point[use], found.plane[use], miss[use].clamp(-MOST_DB, MOST_DB).float()
-    best, most = None, 0.0
-    for width in WIDTHS:
-        marks = Marks(points, plane, level_db, width)
-        others = torch.from_numpy(marks.at(points.double().numpy(), plane.numpy(), leave_out=True)).float()
-        gained = level_db.abs() - (level_db - others).abs()
-        count = torch.bincount(plane, minlength=len(reflection))
-        mean = torch.zeros(len(reflection)).index_add_(0, plane, gained) / count.clamp_min(1)
-        worth = (count >= LEAST_MARKS) & (mean > WORTH_DB)
-        total = float((mean * count)[worth].sum())
-        if total > most:
-            kept = worth[plane]
-            best, most = Marks(points[kept], plane[kept], level_db[kept], width), total
-    return best
+def _design(found: Glints, count: int) -> Tensor:
+    """What of each plane's a, b and c is in each observation, `[n, 3 count]`."""
+    cosine = found.cosine
+    terms = torch.stack((torch.ones_like(cosine), cosine, cosine * cosine), -1)
+    terms = torch.where((found.plane >= 0)[..., None], terms, 0.0)
+    design = torch.zeros(len(found), count + 1, 3, dtype=torch.float64)
+    design.scatter_add_(1, (found.plane % (count + 1))[..., None].expand(-1, -1, 3), terms)
+    return design[:, :count].reshape(len(found), 3 * count)
 
 
 def silent_planes(found: Glints, count: int) -> Tensor:
     """True `[count]` for planes whose images were looked for and mostly not seen."""
-    asked = torch.bincount(found.plane[found.alone], minlength=count)
-    heard = torch.bincount(found.plane[found.alone & found.seen], minlength=count)
+    single = found.only(found.alone & (found.order == 1))
+    asked = torch.bincount(single.plane[:, 0], minlength=count)
+    heard = torch.bincount(single.plane[single.seen, 0], minlength=count)
     return (asked >= SILENT_LEAST) & (heard < SILENT_SHARE * asked)
+
+
+def law_levels(found: Glints, reflection: Tensor) -> Tensor:
+    """The levels `[n]` [dB] that laws `reflection` `[P, 3]` give the observations."""
+    laws = torch.cat((reflection, reflection.new_zeros(1, 3))).double()[found.plane]
+    return (laws[..., 0] + found.cosine * (laws[..., 1] + found.cosine * laws[..., 2])).clamp_max(0.0).sum(-1)
+
+
+def silent_sources(found: Glints, reflection: Tensor, order: Tensor) -> Tensor:
+    """True `[K]` for images of `order` `[K]` that by the laws `reflection` `[P, 3]` should stand out well and mostly
+    were not seen, and for all images of an order from 2 on if its images, taken together, were not.
+    """
+    due = found.only(found.alone & (law_levels(found, reflection) > found.limit_db + DUE_DB))
+
+    def silent(group: Tensor, count: int) -> Tensor:
+        asked, heard = torch.bincount(group, minlength=count), torch.bincount(group[due.seen], minlength=count)
+        return (asked >= SILENT_LEAST) & (heard < SILENT_SHARE * asked)
+
+    orders = silent(due.order, HIGHEST_ORDER + 1)
+    return silent(due.source, len(order)) | ((order > 1) & orders[order])

@@ -13,33 +13,37 @@ from rf3dgs.field.rays import Rays
 from rf3dgs.field.sources import PointSources
 from rf3dgs.geometry import Patches, Planes, Surfaces
 from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
-from rf3dgs.training.consolidation import consolidated, with_skins
+from rf3dgs.training.consolidation import consolidated, squared, with_skins
 from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
-from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_marks, fit_reflection, glints, silent_planes
+from rf3dgs.training.marks import Paint, fit_marks
+from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_reflection, glints, silent_planes, silent_sources
 from rf3dgs.training.timed_mirrors import timed_mirrors, with_timed
 from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, refined_planes, with_mirrors
 
 PROBES = 150
 PROBE_MARGIN = 0.5
-GATES = (0.2, 0.3, 0.1, 0.05, 0.5)  # of transmittance a leg; of equally good ones the first
+GATES = (0.5, 0.3, 0.2, 0.1, 0.05)  # of transmittance; the first is what passes at a silhouette
+WORTH_A_CHANGE = 0.05  # share of what was looked at that another threshold must tell better
 SIGHT_WEIGHT = 3
+TOLD_BY = 2  # reflections at most of the peaks that tell levels
 
 
 @dataclass(frozen=True, eq=False)
 class SourceFit:
     """Point sources and what they are at the training positions.
 
-    seen `[position]`: who sees the transmitter, as the spectra tell. rays: what reaches each position. found: what the
-    spectra show in the directions of the images, or None without images. plane_of `[N]`: the planes of the Gaussians,
-    or None without planes.
+    seen `[position]`: who sees the transmitter, as the spectra tell. rays: what reaches each position. obstacles: the
+    Gaussians as they stop rays, labelled by plane where there are planes, without what stands in ways that were seen to
+    be open. found: what the spectra show in the directions of the images, or None without images.
     """
 
     sources: PointSources
     seen: Tensor
     rays: list[Rays]
-    plane_of: Tensor | None = None
+    obstacles: Obstacles
     found: Glints | None = None
 
 
@@ -49,11 +53,14 @@ def fit_sources(
     obstacles: Obstacles,
     tx: Pose,
     config: SourceConfig | None = None,
+    *,
+    geometry: Gaussians | None = None,
 ) -> SourceFit:
     """The transmitter at `tx` and its images in the planes of `surfaces`, fitted to `spectra` `[position, row, col]`.
 
     Without `surfaces` there is the line of sight alone. Their pieces of large planes are made one, and mirrors that
-    they lack are added; the result says which Gaussians of `obstacles` belong to which plane.
+    they lack are added; the result says which Gaussians of `obstacles` belong to which plane. `geometry`, the same
+    Gaussians with colours, shows where the material of a plane changes.
     """
     config = SourceConfig() if config is None else config
     if not 0 <= config.order <= HIGHEST_ORDER:
@@ -63,7 +70,8 @@ def fit_sources(
     direct, seen = fit_line_of_sight(direct, spectra)
     direct = fit_opening(direct, seen, positions, obstacles)
     if surfaces is None or config.order == 0 or not len(surfaces.planes):
-        return SourceFit(direct, seen, direct.rays_each(positions, obstacles, in_sight=seen))
+        obstacles = replace(obstacles, labels=None).cleared(tx.position.expand_as(positions[seen]), positions[seen])
+        return SourceFit(direct, seen, direct.rays_each(positions, obstacles, in_sight=seen), obstacles)
     probes = torch.cat((positions, _probes(positions, config.seed)))
     surfaces = consolidated(surfaces, obstacles.means)
     obstacles = replace(obstacles, labels=surfaces.plane_of)
@@ -71,6 +79,10 @@ def fit_sources(
     timed = timed_mirrors(spectra, tx.position) if config.complete else []
     if timed:
         sources, surfaces, obstacles = _over(sources, with_timed(sources, timed), surfaces, obstacles)
+    if config.square:
+        surfaces = squared(surfaces)
+        obstacles = replace(obstacles, labels=surfaces.plane_of)
+        sources = replace(sources, planes=surfaces.planes, patches=surfaces.patches)
     sources = with_images(sources, probes, replace(config, order=1))
     peaks = peaks_of(spectra) if config.refine or config.complete else None
     if peaks is not None and config.refine:
@@ -84,14 +96,29 @@ def fit_sources(
             sources = with_images(sources, probes, replace(config, order=1))
             sources = _refined(sources, seen, peaks, positions, obstacles, config)
     sources = _gated(sources, spectra, seen, obstacles)
+    obstacles = cleared_by(sources, spectra, seen, obstacles)
     rays = sources.rays_each(positions, obstacles, in_sight=seen)
     found = glints(sources, rays, spectra)
-    reflection = fit_reflection(found, len(sources.planes))
-    sources = replace(sources, reflection=reflection, marks=fit_marks(found, reflection))
-    sources = with_images(sources, probes, config, silent=silent_planes(found, len(sources.planes)))
-    sources = _strongest(sources, probes, obstacles, spectra, config)
+    sources = replace(sources, reflection=fit_reflection(found, len(sources.planes)))
+    silent = silent_planes(found, len(sources.planes))
+    sources = with_images(sources, probes, replace(config, order=min(config.order, TOLD_BY)), silent=silent)
     rays = sources.rays_each(positions, obstacles, in_sight=seen)
-    return SourceFit(sources, seen, rays, surfaces.plane_of, found)
+    found = glints(sources, rays, spectra)
+    dark = silent_sources(found, sources.reflection, sources.order)
+    found = found.only(~dark[found.source])
+    reflection = fit_reflection(found, len(sources.planes))
+    paint = None if geometry is None else Paint.of(geometry, surfaces.plane_of)
+    assert sources.patches is not None
+    marks = fit_marks(found, reflection, sources.planes, sources.patches, paint)
+    sources = replace(sources, reflection=reflection, marks=marks)
+    if config.order > TOLD_BY:
+        sources = with_images(sources, probes, config)
+    sources = _strongest(sources, probes, obstacles, spectra, config)
+    looked = glints(sources, sources.rays_each(positions, obstacles, in_sight=seen), spectra)
+    dark = silent_sources(looked, sources.reflection, sources.order)
+    sources = replace(sources, sequence=sources.sequence[~dark])
+    rays = sources.rays_each(positions, obstacles, in_sight=seen)
+    return SourceFit(sources, seen, rays, obstacles, found)
 
 
 def with_images(
@@ -129,11 +156,30 @@ def _fitted(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: O
     return replace(sources, reflection=fit_reflection(glints(sources, rays, spectra), len(sources.planes)))
 
 
+def cleared_by(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Obstacles) -> Obstacles:
+    """The obstacles without what stands in ways that the spectra show to be open: lines of sight and single mirrors."""
+    positions = spectra.pose.position
+    ways = [sources.candidates(position, obstacles)[0] for position in positions]
+    looked = glints(sources, ways, spectra)
+    shone = looked.seen & looked.alone
+    receiver, mirror, plane = positions[looked.position[shone]], looked.point[shone, 0], looked.plane[shone, 0]
+    nothing = torch.full_like(plane, -1)
+    straight = positions[seen]
+    free = torch.full((len(straight),), -1)
+    return obstacles.cleared(
+        torch.cat((sources.tx.expand_as(mirror), mirror, sources.tx.expand_as(straight))),
+        torch.cat((mirror, receiver, straight)),
+        skip_start=torch.cat((nothing, plane, free)),
+        skip_end=torch.cat((plane, nothing, free)),
+    )
+
+
 def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Obstacles) -> PointSources:
     """The sources with the threshold that agrees best with who sees the transmitter, and which reflections shine.
 
-    A way that is open and should not be counts twice: it misleads a beam, where one that is missing only costs its own
-    power. The line of sight counts thrice.
+    Silhouettes ask for one half; haze that stands everywhere may ask for less, and must say so clearly. A way that is
+    open and should not be counts twice: it misleads a beam, where one that is missing only costs its own power. The
+    line of sight counts thrice.
     """
     ways = [sources.candidates(position, obstacles) for position in spectra.pose.position]
     looked = glints(sources, [rays for rays, _ in ways], spectra)
@@ -145,7 +191,9 @@ def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Ob
     shone = passed[looked.position, looked.source][looked.alone]
     glints_seen = looked.seen[looked.alone]
     wrong = wrong + 2 * ((shone > gates) & ~glints_seen).sum(-1) + ((shone <= gates) & glints_seen).sum(-1)
-    return replace(sources, open_above=GATES[int(wrong.argmin())])
+    worth = WORTH_A_CHANGE * (SIGHT_WEIGHT * len(seen) + len(shone))
+    best = int(wrong.argmin())
+    return replace(sources, open_above=GATES[best if int(wrong[best]) < int(wrong[0]) - worth else 0])
 
 
 def _refined(

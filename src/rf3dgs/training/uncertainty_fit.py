@@ -10,20 +10,27 @@ from torch import Tensor
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.progress import Progress, Silent
-from rf3dgs.field.lit import BLENDING, LitSurface
+from rf3dgs.field.lit import LitSurface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.field.rays import Rays
 from rf3dgs.field.sources import PointSources
 from rf3dgs.field.uncertainty import NUMBERS, SHARES, Uncertainty, floor_db, numbers_of
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
-from rf3dgs.splats.rasterize import rasterize
 from rf3dgs.training.calibration import calibrate
 from rf3dgs.training.line_of_sight import fit_line_of_sight
-from rf3dgs.training.lit_fit import Scattering, fit_laws, refine_residual
+from rf3dgs.training.lit_fit import Scattering, fit_laws
 from rf3dgs.training.lit_views import LitView, Observations, lit_views, observe
-from rf3dgs.training.mirror import PASSES
+from rf3dgs.training.path_uncertainty_fit import (
+    fit_path_doubt,
+    known_places,
+    left_out_ways,
+    measured_ways,
+    sources_without,
+)
 from rf3dgs.training.radio import check_spectra
+from rf3dgs.training.residual import refine_residual
+from rf3dgs.training.source_fit import cleared_by
 
 LEAST_POSITIONS = 8
 RANDOM_FOLDS, STRIPS = 4, 3
@@ -65,27 +72,38 @@ def fit_uncertainty(field: RadioField, spectra: Spectrum, *, progress: Progress 
         )
     folds = folds_of(spectra.pose.position, seed=int(field.meta.get("seed", 0)))
     progress.start("uncertainty", len(folds))
-    views = lit_views(replace(spectra, delay=None, aod=None), _rays(field, spectra))
+    in_sight = _in_sight(field, spectra)
+    views = lit_views(replace(spectra, delay=None, aod=None), _rays(field, spectra, in_sight))
     shape = (surface.means, surface.quats, surface.log_scales, surface.logit_opacities)
     observed = observe(
         Gaussians(*shape, torch.zeros(len(surface), 1, 1)), views, unit=surface.unit, backend=field.backend
     )
     observed = replace(observed, level_db=observed.level_db.clamp_min(floor_db(surface)))
     tables = _Tables.empty(len(views), len(surface.cell_sh), _planes(field) + 1)
+    measured = measured_ways(field, spectra)
     missed = []
     for number, places in enumerate(folds):
-        left_out = _left_out(field, views, observed, spectra, places, tables, bake=number < RANDOM_FOLDS)
+        without = replace(field, sources=sources_without(field.sources, measured, places))
+        without = replace(without, solidity=_solidity_without(field, spectra, in_sight, places))
+        left_out = _left_out(without, views, observed, spectra, places, tables, bake=number < RANDOM_FOLDS)
         missed.append(left_out)
         progress.update(number + 1)
     seen = torch.zeros(len(surface.cell_sh), len(views))
     seen.index_put_((surface.cell_of[observed.gaussian], observed.view), observed.weight, accumulate=True)
-    rows = [_rows(one, tables, spectra, seen > LEAST_SEEN) for one in missed]
+    rows, ways = [], []
+    for one in missed:
+        others = [place for place in range(len(spectra)) if place not in one.places]
+        doubt = _doubt(surface, tables, spectra, others, seen > LEAST_SEEN)
+        rows.append(_rows(one, doubt, spectra))
+        known = known_places(measured, one.places)
+        for place, error_db in zip(one.places, one.error_db, strict=True):
+            ways.append(left_out_ways(one.field, doubt, known, spectra[place], error_db))
     numbers, error, counts = (torch.cat(part) for part in zip(*rows, strict=True))
     weights, widths = calibrate(numbers, error, counts)
-    everyone = list(range(len(views)))
-    doubt = _doubt(surface, tables, spectra, everyone, seen > LEAST_SEEN)
+    paths = fit_path_doubt(ways, weights, known_places(measured, [])) if field.sources is not None else None
+    doubt = _doubt(surface, tables, spectra, list(range(len(views))), seen > LEAST_SEEN)
     progress.finish()
-    return replace(field, doubt=replace(doubt, weights=weights, widths=widths))
+    return replace(field, doubt=replace(doubt, weights=weights, widths=widths, paths=paths))
 
 
 def folds_of(positions: Tensor, *, seed: int) -> list[list[int]]:
@@ -138,12 +156,27 @@ def _drawn(sums: Tensor, to: Tensor, shrink: float) -> Tensor:
     return (sums[:, 1] + shrink * to) / (sums[:, 0] + shrink)
 
 
-def _rays(field: RadioField, spectra: Spectrum) -> list[Rays] | None:
+def _in_sight(field: RadioField, spectra: Spectrum) -> Tensor:
+    """Which training positions see the transmitter `[V]`, as the spectra tell."""
+    return fit_line_of_sight(PointSources.line_of_sight(field.tx.position, field.frequency), spectra)[1]
+
+
+def _rays(field: RadioField, spectra: Spectrum, in_sight: Tensor) -> list[Rays] | None:
     """What reaches the training positions from point sources; the spectra decide the line of sight."""
     if field.sources is None:
         return None
-    seen = fit_line_of_sight(PointSources.line_of_sight(field.tx.position, field.frequency), spectra)[1]
-    return field.sources.rays_each(spectra.pose.position, field.obstacles, in_sight=seen)
+    return field.sources.rays_each(spectra.pose.position, field.obstacles, in_sight=in_sight)
+
+
+def _solidity_without(field: RadioField, spectra: Spectrum, in_sight: Tensor, places: list[int]) -> Tensor:
+    """How far the Gaussians stop rays `[N]` when some positions did not tell which ways are free."""
+    surface = field.surface
+    if field.sources is None or not bool((field.solidity > 0).any()):
+        return field.solidity
+    others = torch.tensor([place for place in range(len(spectra)) if place not in places])
+    before = replace(field.obstacles, opacities=surface.opacities)
+    once = replace(field.sources, sequence=field.sources.sequence[field.sources.order <= 1])
+    return cleared_by(once, spectra[others], in_sight[others], before).opacities
 
 
 def _planes(field: RadioField) -> int:
@@ -169,8 +202,8 @@ def _left_out(
     some = replace(observed, csi=None, **{name: getattr(observed, name)[used] for name in rows})
     numbers = (surface.segment_of, surface.cell_of, surface.tx)
     scattering = Scattering.of(surface.means, surface.normals, surface.visibility, *numbers)
-    bare = replace(surface.without_residual(), laws=fit_laws(scattering, some))
-    fitted = refine_residual(bare, kept, passes=PASSES, floor_db=floor_db(surface), backend=field.backend)
+    bare = replace(surface.without_residual(), laws=fit_laws(scattering, some), ambient_shift=None)
+    fitted = refine_residual(bare, kept, floor_db=floor_db(surface), backend=field.backend)
     without = replace(field, surface=fitted)
     errors, counts = [], []
     for place in places:
@@ -190,29 +223,28 @@ def _errors(
     with torch.no_grad():
         sent = surface.values(receiver, csi=False)
     values = sent.expand(-1, 2).contiguous().requires_grad_()
-    shape = (surface.means, surface.quats, surface.scales, surface.opacities)
     with torch.enable_grad():
-        raster = rasterize(*shape, values, view.view, compositing=BLENDING, backend=field.backend)
-        shown = raster.values.detach()[..., 0] * surface.unit
+        drawn = surface.seen(values, view.view, field.backend)
+        shown = drawn.detach()[..., 0] * surface.unit
         rays = None if field.sources is None else field.sources.rays(receiver, field.obstacles)
         if rays is not None:
             shown = shown + rays.picture(truth.pose, truth.grid, truth.instrument)
         floor = torch.full_like(shown, 10 ** (floor_db(surface) / 10))
         floor = floor if truth.floor is None else torch.maximum(floor, truth.floor)
         error = 10 * torch.log10(torch.maximum(truth.power, floor) / torch.maximum(shown, floor)).nan_to_num(0.0)
-        error = error.clamp(-FARTHEST_DB, FARTHEST_DB)
+        square = error.clamp(-FARTHEST_DB, FARTHEST_DB).square()
         area = truth.grid.solid_angle / truth.grid.solid_angle.mean()
         counts = area * ((truth.power > floor) | (shown > floor))
         if row is None:
             return error, counts
         upstream = counts * surface.unit / torch.where(shown > 0, shown, 1.0)
-        upstream = torch.stack((upstream, upstream * error.square()), -1)
-        (sums,) = torch.autograd.grad(raster.values, values, upstream)
+        upstream = torch.stack((upstream, upstream * square), -1)
+        (sums,) = torch.autograd.grad(drawn, values, upstream)
     tables.cells[row].index_add_(0, surface.cell_of, sums * sent)
     if rays is not None and field.sources is not None:
         place, ray, power = rays.shares(truth.pose, truth.grid, truth.instrument)
         share = (counts / torch.where(shown > 0, shown, 1.0)).flatten()[place] * power
-        known = torch.stack((share, share * error.flatten()[place].square()), -1)
+        known = torch.stack((share, share * square.flatten()[place]), -1)
         planes = field.sources.sequence[rays.index[ray]]
         planes[:, 0] = torch.where(planes[:, 0] < 0, tables.planes.shape[1] - 1, planes[:, 0])
         for step in planes.unbind(-1):
@@ -220,13 +252,10 @@ def _errors(
     return error, counts
 
 
-def _rows(one: LeftOut, tables: _Tables, spectra: Spectrum, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _rows(one: LeftOut, doubt: Uncertainty, spectra: Spectrum) -> tuple[Tensor, Tensor, Tensor]:
     """Numbers `[n, 10]`, errors and counts `[n]` of pixels at positions that were left out, by what the others tell."""
-    surface = one.field.surface
-    assert isinstance(surface, LitSurface)
-    others = [place for place in range(len(spectra)) if place not in one.places]
-    doubt = _doubt(surface, tables, spectra, others, seen)
     numbers = [numbers_of(one.field, doubt, spectra.pose[place], spectra.grid).flatten(0, 1) for place in one.places]
     every = max(1, len(spectra) * 2 * spectra.grid.solid_angle.numel() // MOST)
     chosen = torch.arange(0, one.error_db.numel(), every)
-    return torch.cat(numbers)[chosen], one.error_db.flatten()[chosen], one.counts.flatten()[chosen]
+    error = one.error_db.flatten()[chosen].clamp(-FARTHEST_DB, FARTHEST_DB)
+    return torch.cat(numbers)[chosen], error, one.counts.flatten()[chosen]
