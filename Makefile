@@ -43,8 +43,10 @@ $(VENV)/test.stamp: $(VENV)/package.stamp
 demo: $(VENV)/package.stamp
 	$(BIN)/rf3dgs demo --out $(OUT)/demo
 
+# Files of tests run side by side, one on each core; four at most, for each takes a few GiB.
+test: export OMP_NUM_THREADS ?= 1
 test: $(VENV)/test.stamp
-	$(BIN)/python -m pytest -m "not slow and not gpu"
+	$(BIN)/python -m pytest -m "not slow and not gpu" -n logical --maxprocesses 4 --dist loadfile
 
 # The splatting core's tests with each of its instruction sets; a machine without one runs them with the next narrower.
 test-isa: $(VENV)/test.stamp

@@ -91,3 +91,15 @@ def test_the_gradient_is_that_of_finite_differences(grid):
     generator = torch.Generator().manual_seed(0)
     picture = torch.rand(*grid.shape, 2, generator=generator, dtype=torch.float64).requires_grad_()
     assert torch.autograd.gradcheck(lambda one: through_lobe(one, view_of(HERE, grid), 1.0), (picture,))
+
+
+@pytest.mark.parametrize("grid", [SPHERE, CAMERA], ids=["sphere", "camera"])
+def test_far_from_everything_there_is_nothing_and_beside_it_the_same_delay(grid):
+    picture = torch.zeros(*grid.shape, 2)
+    picture[20:24, 30:34] = torch.tensor([1.0, 40.0])
+    shown = through_lobe(picture, view_of(HERE, grid), LOBE)
+    reached = shown[..., 0] > 0
+    assert 0.02 < float(reached.float().mean()) < 0.3
+    assert not bool(shown[~reached].any())
+    delay = shown[reached][:, 1] / shown[reached][:, 0]
+    torch.testing.assert_close(delay, torch.full_like(delay, 40.0), rtol=2e-2, atol=0.0)

@@ -235,3 +235,20 @@ def test_the_surface_of_a_field_is_refined_unless_it_is_not_to_be(training):
 def test_steps_of_joint_refinement_belong_to_the_mirror_model(training, model, steps):
     with pytest.raises(InputError, match=f"joint counts steps .*; got {steps} with the model '{model}'"):
         fit_radio(room(), training[0], RadioConfig(model=model, joint=steps))
+
+
+def test_where_nothing_stands_the_surface_stays_finite(training):
+    spectra, rays = training
+    surface = wrong()
+    under_the_sky = surface.means[:, 2] < 2.0
+    per_gaussian = [item.name for item in fields(surface) if len_of(getattr(surface, item.name)) == len(surface)]
+    cut = {name: getattr(surface, name)[under_the_sky] for name in per_gaussian}
+    surface = replace(surface, **cut, lobe=math.radians(4))
+    found = refine_jointly(surface, rays, spectra, steps=12, seed=0, floor_db=FLOOR_DB)
+    for name, x in numbers(found).items():
+        assert bool(torch.isfinite(x).all()), name
+    assert not torch.equal(found.level, surface.level)
+
+
+def len_of(value) -> int:
+    return len(value) if isinstance(value, torch.Tensor) and value.dim() else 0

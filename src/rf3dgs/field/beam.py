@@ -14,18 +14,24 @@ from torch import Tensor
 from rf3dgs.core.grids import Panorama, View
 
 HALF_POWER = 2 * math.sqrt(2 * math.log(2))  # half-power widths in a standard deviation
+DARKEST = 1e-13  # of the brightest pixel; sums in float64 tell nothing apart below
 
 
 def through_lobe(picture: Tensor, view: View, lobe: float) -> Tensor:
     """The `picture` `[row, col, channel]` of a `view` as a Gaussian lobe of half-power width `lobe` [rad] sees it.
 
     A mean weighted by solid angle, of what is in the picture; differentiable, and the picture itself where the lobe is
-    0.
+    0. The first channel is power: where it comes out under `DARKEST` of its largest value all channels are zero.
     """
     if lobe <= 0:
         return picture
-    if isinstance(view, Panorama):
-        return _on_sphere(picture, lobe)
+    blurred = _on_sphere(picture, lobe) if isinstance(view, Panorama) else _in_camera(picture, view, lobe)
+    power = blurred[..., :1].detach()
+    return torch.where(power > DARKEST * power.amax(), blurred, 0.0)
+
+
+def _in_camera(picture: Tensor, view: View, lobe: float) -> Tensor:
+    """Along columns, then along rows."""
     sizes = (view.width, view.height)
     centres = ((float(view.K[axis, axis]), float(view.K[axis, 2])) for axis in (0, 1))
     along, down = (_camera_filter(size, *one, lobe) for size, one in zip(sizes, centres, strict=True))

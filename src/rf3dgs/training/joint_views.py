@@ -72,7 +72,7 @@ def misfit(shown: Tensor, one: JointView) -> Tensor:
     error = 10 * torch.log10(level.clamp_min(least) / truth.clamp_min(one.floor))
     cost = SOFT_DB**2 * _soft((error / SOFT_DB).square())
     if one.has_csi:
-        hit = above & (level.detach() > 0)
+        hit = above & (level.detach() > least)
         some = torch.where(hit, level, 1.0)
         late = shown[..., 1] / some - one.truth[..., 1]
         turned = normalize(shown[..., 2:] / some[..., None], dim=-1, eps=1e-6) - one.truth[..., 2:]
