@@ -26,7 +26,7 @@ from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, re
 PROBES = 150
 PROBE_MARGIN = 0.5
 GATES = (0.5, 0.3, 0.2, 0.1, 0.05)  # of transmittance; the first is what passes at a silhouette
-WORTH_A_CHANGE = 0.05  # share of what was looked at that another threshold must tell better
+WORTH_A_CHANGE = 0.01  # share of what was looked at that another threshold must tell better
 SIGHT_WEIGHT = 3
 TOLD_BY = 2  # reflections at most of the peaks that tell levels
 
