@@ -9,6 +9,7 @@ Ideal spectra, spheres of 180x90. Rows:
     moved                 the mirror model fitted to 40 positions at the old place, `moved_to` the new one
     moved, old residual   the same with the residual that `moved_to` drops
     moved, old shadows    the same with the shadows of the old place
+    moved, gate 0.1       the same with ways open where a tenth passes, whatever the fit found
     moved, then 10        the moved field, refined by the ten measurements at the new place
     never moved           the field of the old place as it is: what moving does at all
     nearest, idw4         lookups in these ten
@@ -94,7 +95,8 @@ def variants(field: RadioField, tx: Pose) -> dict[str, Predictor]:
     """The moved field, and what it would be without one thing that moving does."""
     began = time.process_time()
     moved = field.moved_to(tx)
-    print(f"moved in {time.process_time() - began:.1f} s of CPU time, {len(moved.sources or ())} point sources")
+    assert moved.sources is not None
+    print(f"moved in {time.process_time() - began:.1f} s of CPU time, {len(moved.sources)} point sources")
     old, new = field.surface, moved.surface
     assert isinstance(old, LitSurface)
     assert isinstance(new, LitSurface)
@@ -104,6 +106,7 @@ def variants(field: RadioField, tx: Pose) -> dict[str, Predictor]:
         "moved": moved,
         "moved, old residual": replace(moved, surface=residual),
         "moved, old shadows": replace(moved, surface=shadows),
+        "moved, gate 0.1": replace(moved, sources=replace(moved.sources, open_above=0.1)),
         "never moved": field,
     }
 
