@@ -11,7 +11,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from rf3dgs.core.grids import Panorama, View
+from rf3dgs.core.grids import Camera, Panorama, View
 
 HALF_POWER = 2 * math.sqrt(2 * math.log(2))  # half-power widths in a standard deviation
 DARKEST = 1e-13  # of the brightest pixel; sums in float64 tell nothing apart below
@@ -30,7 +30,7 @@ def through_lobe(picture: Tensor, view: View, lobe: float) -> Tensor:
     return torch.where(power > DARKEST * power.amax(), blurred, 0.0)
 
 
-def _in_camera(picture: Tensor, view: View, lobe: float) -> Tensor:
+def _in_camera(picture: Tensor, view: Camera, lobe: float) -> Tensor:
     """Along columns, then along rows."""
     sizes = (view.width, view.height)
     centres = ((float(view.K[axis, axis]), float(view.K[axis, 2])) for axis in (0, 1))
