@@ -263,3 +263,13 @@ def test_where_no_plane_is_found_geometry_stays_and_none_is_made_of_echoes(monke
     assert torch.equal(corrected(before, single()).means, before.means)
     with pytest.raises(InputError, match="echoes lie on no common plane"):
         radio_geometry.geometry_of_echoes(echoes_of(single(), TX))
+
+
+def test_wide_gaussians_leave_no_gaps_to_fill():
+    fine, coarse = room(0.1), room(1.0)
+    assert float(coarse.scales.amax(-1).median()) > 0.4
+    assert len(radio_geometry.completed_by(coarse, fine)) < 1.02 * len(coarse)
+    holed = room(1.0, without=0)
+    added = radio_geometry.completed_by(holed, fine).means[len(holed) :]
+    assert len(added) > 100
+    assert float((off_the_walls(added) < 0.05).float().mean()) == 1.0

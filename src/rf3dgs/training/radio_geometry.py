@@ -41,6 +41,7 @@ SEARCH = SurfaceConfig(tolerance=0.05, min_area=0.5)
 OUTSIDE = 0.5  # how far beyond the receivers and what they see a site reaches, where mirrors alone are known [m]
 TRUSTED = 0.2  # share of a plane's surface that echoes must speak for, where Gaussians are moved to it
 APART = 0.25  # Gaussians from echoes complete those of photographs where none is this near [m]
+WIDTHS = 2.0  # nor within so many standard deviations of the usual Gaussian, if that is farther
 
 
 def geometry_from_spectra(spectra: Spectrum, tx: Pose | None = None, *, seed: int = 0) -> Gaussians:
@@ -112,10 +113,12 @@ def completed_by(geometry: Gaussians, other: Gaussians) -> Gaussians:
     """The Gaussians, and those of `other` that no opaque one is near."""
     from scipy.spatial import KDTree
 
-    opaque = geometry.means[geometry.opacities >= SEARCH.min_opacity]
+    solid = geometry.opacities >= SEARCH.min_opacity
+    opaque = geometry.means[solid]
     if not len(opaque):
         return other
-    alone = torch.from_numpy(KDTree(opaque.numpy()).query(other.means.numpy())[0] > APART)
+    apart = max(APART, WIDTHS * float(geometry.scales[solid].amax(-1).median()))
+    alone = torch.from_numpy(KDTree(opaque.numpy()).query(other.means.numpy())[0] > apart)
     sh = torch.zeros(int(alone.sum()), geometry.sh.shape[1], geometry.channels)
     parts = {name: part[alone] for name, part in other.tensors().items()} | {"sh": sh}
     return Gaussians.join((geometry, Gaussians(**parts)))
