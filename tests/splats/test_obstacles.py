@@ -279,6 +279,10 @@ def test_a_segment_that_is_known_to_be_free_is_cleared(seed: int) -> None:
     )
     far = torch.tensor([0.0, 0.6, 0.0])
     assert float(lump.cleared(ends[0] + far, ends[1] + far).opacities) == pytest.approx(0.9)
+    nowhere = torch.tensor([[float("nan"), 0, 0]]), torch.tensor([[float("inf"), 0, 0]])
+    assert float(lump.cleared(*nowhere).opacities) == pytest.approx(0.9)
+    with pytest.raises(InputError, match="stop_short must be a length"):
+        lump.cleared(*ends, stop_short=-0.1)
     labelled = replace(lump, labels=torch.tensor([4]))
     assert float(labelled.cleared(*ends, skip_start=torch.tensor([4])).opacities) == pytest.approx(0.9)
 

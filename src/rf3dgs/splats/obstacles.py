@@ -14,9 +14,10 @@ from torch import Tensor
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.native import native_core, thread_count
-from rf3dgs.splats.transmittance import cleared_opacities, segment_transmittance
+from rf3dgs.splats.transmittance import coverage, segment_transmittance
 
 SOFT_RADIUS = 0.02  # m
+CLEAR = 0.05  # most that a Gaussian may stop of a segment that is known to be free
 RAYS = 7  # of a soft gate
 FEW = 256  # segments that are answered sooner than other threads wake
 _SOFT_CHUNK = 200_000  # segments
@@ -69,10 +70,7 @@ class Obstacles:
         `stop_short` [m] is cut off at both ends. A segment of no length left is free, one that is not finite passes
         nothing.
         """
-        start, end = _segments(start, end)
-        if not 0 <= stop_short < math.inf:
-            raise InputError(f"stop_short must be a length in metres, 0 or more; got {stop_short}")
-        first, last = (self._skip(skip, len(start), name) for skip, name in ((skip_start, "start"), (skip_end, "end")))
+        start, end, first, last = self._asked(start, end, skip_start, skip_end, stop_short)
         if self._tree is None:
             return segment_transmittance(
                 *(self.means, self.quats, self.scales, self.opacities, start, end),
@@ -88,6 +86,7 @@ class Obstacles:
         self._tree.transmittance(_floats(start), _floats(end), *skips, stop_short, passed.numpy(), threads)
         return passed
 
+    @torch.no_grad()
     def cleared(
         self,
         start: Tensor,
@@ -100,15 +99,19 @@ class Obstacles:
         """The obstacles without what stands in segments that are known to be free; arguments as of `transmittance`.
 
         Gaussians that a segment meets become fainter, the more the nearer they are to it, until none of them stops
-        more than a twentieth.
+        more than `CLEAR`.
         """
-        start, end = _segments(start, end)
-        first, last = (self._skip(skip, len(start), name) for skip, name in ((skip_start, "start"), (skip_end, "end")))
-        shape = (self.means, self.quats, self.scales, self.opacities)
-        opacities = cleared_opacities(
-            *(*shape, start, end), labels=self.labels, skip_start=first, skip_end=last, stop_short=stop_short
-        )
-        return replace(self, opacities=opacities)
+        start, end, *skips = self._asked(start, end, skip_start, skip_end, stop_short)
+        solid = self.opacities > CLEAR
+        widest = torch.zeros_like(self.opacities)
+        for _, gaussian, covered in coverage(
+            *(self.means, self.quats, self.scales, solid, start.to(self.means.dtype), end.to(self.means.dtype)),
+            labels=self.labels,
+            skips=[skip for skip in skips if skip is not None],
+            stop_short=stop_short,
+        ):
+            widest.scatter_reduce_(0, gaussian, covered, "amax")
+        return replace(self, opacities=torch.minimum(self.opacities, CLEAR / widest.clamp_min(1e-12)))
 
     def soft(
         self,
@@ -152,6 +155,16 @@ class Obstacles:
         labels = None if self.labels is None else self.labels.clamp_min(-1).int().contiguous().numpy()
         shape = (_floats(tensor) for tensor in (self.means, self.quats, self.scales, self.opacities))
         return core.Obstacles(*shape, labels, self.min_opacity)
+
+    def _asked(
+        self, start: Tensor, end: Tensor, skip_start: Tensor | None, skip_end: Tensor | None, stop_short: float
+    ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+        """The arguments of a question, checked: both ends `[segment, 3]` and what is skipped `[segment]`."""
+        start, end = _segments(start, end)
+        if not 0 <= stop_short < math.inf:
+            raise InputError(f"stop_short must be a length in metres, 0 or more; got {stop_short}")
+        first, last = (self._skip(skip, len(start), name) for skip, name in ((skip_start, "start"), (skip_end, "end")))
+        return start, end, first, last
 
     def _skip(self, skip: Tensor | None, count: int, end: str) -> Tensor | None:
         if skip is None:

@@ -4,7 +4,7 @@ This is not the alpha of a picture: each Gaussian counts once, with its peak alo
 `splats.obstacles` answers the same question in the native core.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -39,70 +39,36 @@ def segment_transmittance(
     those of `labels` `[gaussian]` that equal the segment's `skip_start` or `skip_end` `[segment]`, where these are
     not negative. The result carries no gradient.
     """
-    start, end, finite = _segments(start, end, means.dtype)
+    start, end = _segments(start, end, means.dtype)
     passed = torch.zeros_like(start[:, 0])
-    reach = torch.where(opacities >= min_opacity, scales.amax(-1) * CUT, -1.0)
     skips = () if labels is None else tuple(skip for skip in (skip_start, skip_end) if skip is not None)
-    for segment, gaussian, covered in _coverage(
-        means, quats, scales, reach, start, end, labels=labels, skips=skips, stop_short=stop_short
+    for segment, gaussian, covered in coverage(
+        *(means, quats, scales, opacities >= min_opacity, start, end), labels=labels, skips=skips, stop_short=stop_short
     ):
         passed.index_add_(0, segment, torch.log1p(-opacities[gaussian].clamp_max(1.0) * covered))
-    return torch.where(finite, torch.exp(passed), 0.0)
+    return torch.where(_finite(start, end), torch.exp(passed), 0.0)
 
 
-@torch.no_grad()
-def cleared_opacities(
+def coverage(
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
-    opacities: Tensor,
-    start: Tensor,
-    end: Tensor,
-    *,
-    labels: Tensor | None = None,
-    skip_start: Tensor | None = None,
-    skip_end: Tensor | None = None,
-    stop_short: float = 0.10,
-    most: float = 0.05,
-) -> Tensor:
-    """The opacities `[gaussian]`, lowered until none of the Gaussians stops more than `most` of any of the segments.
-
-    The arguments are those of `segment_transmittance`. Whoever knows that a segment is free learns what is not there.
-    """
-    start, end, finite = _segments(start, end, means.dtype)
-    reach = torch.where(opacities > most, scales.amax(-1) * CUT, -1.0)
-    skips = () if labels is None else tuple(skip for skip in (skip_start, skip_end) if skip is not None)
-    widest = torch.zeros_like(opacities)
-    for segment, gaussian, covered in _coverage(
-        means, quats, scales, reach, start, end, labels=labels, skips=skips, stop_short=stop_short
-    ):
-        widest.scatter_reduce_(0, gaussian, torch.where(finite[segment], covered, 0.0), "amax")
-    return torch.minimum(opacities, most / widest.clamp_min(1e-12))
-
-
-def _segments(start: Tensor, end: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-    """Both ends `[segment, 3]`, points in the origin where one is not finite, and who is finite `[segment]`."""
-    start, end = torch.broadcast_tensors(torch.atleast_2d(start), torch.atleast_2d(end))
-    if start.shape[-1] != 3 or start.dim() != 2:
-        raise InputError(f"start and end must be [segment, 3] in metres; got {list(start.shape)}")
-    start, end = start.to(dtype), end.to(dtype)
-    finite = torch.isfinite(torch.linalg.vector_norm(end - start, dim=-1)) & torch.isfinite(start).all(-1)
-    return torch.where(finite[:, None], start, 0.0), torch.where(finite[:, None], end, 0.0), finite
-
-
-def _coverage(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    reach: Tensor,
+    chosen: Tensor,
     start: Tensor,
     end: Tensor,
     *,
     labels: Tensor | None,
-    skips: tuple[Tensor, ...],
+    skips: Sequence[Tensor],
     stop_short: float,
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Triples (segment, Gaussian, exp(-d^2 / 2)) of pairs within `reach`, in parts; 0 for those that are skipped."""
+    """Triples (segment, Gaussian, exp(-d^2 / 2)), in parts, of all segments that come near a `chosen` `[gaussian]` one.
+
+    The arguments are those of `segment_transmittance`, of which this is the sum over pairs. It is 0 for a Gaussian
+    whose label is one of the segment's `skips` `[segment]`, and for what is not finite or has no length left.
+    """
+    finite = _finite(start, end)
+    start, end = torch.where(finite[:, None], start, 0.0), torch.where(finite[:, None], end, 0.0)
+    reach = torch.where(chosen, scales.amax(-1) * CUT, -1.0)
     span = end - start
     length = torch.linalg.vector_norm(span, dim=-1)
     along = span / length.clamp_min(1e-9)[:, None]
@@ -118,12 +84,26 @@ def _coverage(
         nearest = torch.minimum(torch.maximum(nearest, low), high)
         distance2 = (offset + nearest[:, None] * step).square().sum(-1)
         sound = torch.isfinite(scales[gaussian]).all(-1) & (quats[gaussian].square().sum(-1) > 1e-24)
-        covered = torch.where((high > low) & sound, torch.exp(-0.5 * distance2), 0.0).nan_to_num(0.0)
+        sound &= (high > low) & finite[index][segment]
+        covered = torch.where(sound, torch.exp(-0.5 * distance2), 0.0).nan_to_num(0.0)
         for skip in skips:
             assert labels is not None
             of_segment = skip[index][segment]
             covered = torch.where((labels[gaussian] == of_segment) & (of_segment >= 0), 0.0, covered)
         yield index[segment], gaussian, covered
+
+
+def _segments(start: Tensor, end: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Both ends `[segment, 3]`, as many."""
+    start, end = torch.broadcast_tensors(torch.atleast_2d(start), torch.atleast_2d(end))
+    if start.shape[-1] != 3 or start.dim() != 2:
+        raise InputError(f"start and end must be [segment, 3] in metres; got {list(start.shape)}")
+    return start.to(dtype), end.to(dtype)
+
+
+def _finite(start: Tensor, end: Tensor) -> Tensor:
+    """Which segments `[segment]` have both ends, and a length, that are finite."""
+    return torch.isfinite(torch.linalg.vector_norm(end - start, dim=-1)) & torch.isfinite(start).all(-1)
 
 
 def _near_pairs(means: Tensor, reach: Tensor, start: Tensor, along: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
