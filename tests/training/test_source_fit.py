@@ -25,7 +25,7 @@ from rf3dgs.training.consolidation import squared, surface_points
 from rf3dgs.training.marks import Paint, fit_marks
 from rf3dgs.training.radio_views import ruled
 from rf3dgs.training.reflection import Glints, fit_reflection, glints, on_time, ray_powers
-from rf3dgs.training.source_fit import fit_sources
+from rf3dgs.training.source_fit import GATES, _gated, fit_sources
 from rf3dgs.training.timed_mirrors import timed_mirrors
 
 SIZE = torch.tensor([9.0, 7.0, 3.2])
@@ -200,6 +200,17 @@ def test_the_gate_follows_reflections_that_shine_through_haze(spectra):
     through = fit_sources(spectra, hazy, haze(120, 0.4), Pose(TX), SourceConfig(complete=False, order=1))
     ways = [int(sum(len(one) for one in fit.rays)) for fit in (clear, through)]
     assert ways[1] > 0.9 * ways[0]
+
+
+def test_the_gate_asks_more_proof_of_peaks_without_delay(fitted, spectra):
+    """Haze in four of sixteen lines of sight: with delays that is enough for a lower gate, without it is not."""
+    middles = 0.5 * (TX + spectra.pose.position[::4])
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(4, 4).contiguous()
+    lumps = Obstacles(middles, quats, torch.full((4, 3), 0.03), torch.full((4,), 0.65))
+    assert bool(fitted.seen.all())
+    assert _gated(fitted.sources, spectra, fitted.seen, lumps).open_above == 0.3  # the highest gate that 0.35 passes
+    untimed = replace(spectra, delay=None, aod=None)
+    assert _gated(fitted.sources, untimed, fitted.seen, lumps).open_above == GATES[0]
 
 
 def test_what_hides_a_reflection_that_shines_is_cleared(spectra):

@@ -27,6 +27,7 @@ PROBES = 150
 PROBE_MARGIN = 0.5
 GATES = (0.5, 0.3, 0.2, 0.1, 0.05)  # of transmittance; the first is what passes at a silhouette
 WORTH_A_CHANGE = 0.01  # share of what was looked at that another threshold must tell better
+UNTIMED = 5  # times as much is asked where no delay says whether a peak is the reflection
 SIGHT_WEIGHT = 3
 TOLD_BY = 2  # reflections at most of the peaks that tell levels
 
@@ -179,7 +180,7 @@ def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Ob
 
     Silhouettes ask for one half; haze that stands everywhere may ask for less, and must say so clearly. A way that is
     open and should not be counts twice: it misleads a beam, where one that is missing only costs its own power. The
-    line of sight counts thrice.
+    line of sight counts thrice. Peaks without a delay prove less.
     """
     ways = [sources.candidates(position, obstacles) for position in spectra.pose.position]
     looked = glints(sources, [rays for rays, _ in ways], spectra)
@@ -191,7 +192,8 @@ def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Ob
     shone = passed[looked.position, looked.source][looked.alone]
     glints_seen = looked.seen[looked.alone]
     wrong = wrong + 2 * ((shone > gates) & ~glints_seen).sum(-1) + ((shone <= gates) & glints_seen).sum(-1)
-    worth = WORTH_A_CHANGE * (SIGHT_WEIGHT * len(seen) + len(shone))
+    proof = WORTH_A_CHANGE * (UNTIMED if spectra.delay is None else 1)
+    worth = proof * (SIGHT_WEIGHT * len(seen) + len(shone))
     best = int(wrong.argmin())
     return replace(sources, open_above=GATES[best if int(wrong[best]) < int(wrong[0]) - worth else 0])
 
