@@ -123,6 +123,22 @@ def test_curved_surfaces_have_hardly_a_hole() -> None:
     assert float((passed > 0.1).float().mean()) < 0.01
 
 
+def test_gaussians_reach_over_an_edge_by_less_than_their_spacing() -> None:
+    """What passes along the edge of a plate, and a spacing beside it: how far a silhouette stands from the mesh's."""
+    cloud = sample_mesh(*square(), spacing=0.02)
+    edge = float(square()[0][:, 0].max())
+    along = torch.linspace(0.2, 0.8, 200) * edge
+    passed = []
+    for beside in (-0.02, 0.0, 0.02):
+        start = torch.stack((torch.full_like(along, edge + beside), along, torch.full_like(along, -1.0)), -1)
+        end = start * torch.tensor([1.0, 1.0, -1.0])
+        shape = cloud.means, cloud.quats, cloud.scales, cloud.opacities
+        passed.append(float(segment_transmittance(*shape, start, end).median()))
+    assert passed[0] < 0.02
+    assert passed[1] == pytest.approx(0.08, abs=0.03)
+    assert passed[2] > 0.9
+
+
 def test_faces_without_area_are_left_out() -> None:
     vertices, faces = square()
     more = torch.cat((faces, torch.tensor([[0, 0, 1], [1, 1, 1]])))
