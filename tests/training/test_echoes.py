@@ -19,7 +19,7 @@ from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.surface import normals, sample_mesh
 from rf3dgs.training import corrected, geometry_from_spectra, radio_geometry
-from rf3dgs.training.echo_planes import behind, filled, in_free_space, refined_by_echoes
+from rf3dgs.training.echo_planes import REACH, behind, bounding, filled, in_free_space, refined_by_echoes
 from rf3dgs.training.echoes import Echoes, echoes_of, merged
 
 HIGH = torch.tensor([6.0, 5.0, 3.0])
@@ -181,6 +181,31 @@ def test_behind_is_what_a_wall_hides_from_all_receivers():
     assert behind(places, wall, Patches.of(wall, [points]), echoes).tolist() == [True, False, False]
     screen = Planes(across, torch.tensor([2.5]))  # with receivers on both sides
     assert not bool(behind(places, screen, Patches.of(screen, [points.roll(1, 1)]), echoes).any())
+
+
+@pytest.mark.parametrize(("on_it", "bounds"), [(150, []), (1500, [0])])
+def test_a_plane_with_more_echoes_behind_it_than_on_it_bounds_nothing(on_it, bounds):
+    echoes = echoes_of(single(), TX)
+    normal = torch.tensor([-math.sqrt(0.5), -math.sqrt(0.5), 0.0])  # cuts off a corner of the room
+    offset = (echoes.points @ normal).quantile(0.015) + REACH
+    middle = offset * normal + torch.tensor([0.5, -0.5, 0.0])
+    along, up = torch.tensor([math.sqrt(0.5), -math.sqrt(0.5), 0.0]), torch.tensor([0.0, 0.0, 1.0])
+    share = torch.rand(on_it, 2, generator=torch.Generator().manual_seed(0)) - 0.5
+    places = middle + 1.2 * share[:, :1] * along + (1.5 + 2.4 * share[:, 1:]) * up
+    plane = Planes(normal[None], offset[None])
+    y, z = torch.meshgrid(torch.arange(-0.6, 0.6, 0.1), torch.arange(0.3, 2.7, 0.1), indexing="ij")
+    patch = Patches.of(plane, [(middle + y[..., None] * along + z[..., None] * up).reshape(-1, 3)])
+    more = Echoes(
+        torch.cat((echoes.points, places)),
+        torch.cat((echoes.view, torch.zeros(on_it, dtype=torch.long))),
+        torch.cat((echoes.error, torch.full((on_it,), 0.05))),
+        echoes.receivers,
+        echoes.tx,
+    )
+    beyond = int((more.points @ normal - offset < -REACH).sum())
+    assert 150 < beyond < 1500
+    assert float(patch.areas[0]) > 2.0
+    assert bounding(plane, patch, more) == bounds
 
 
 @pytest.fixture(scope="module")

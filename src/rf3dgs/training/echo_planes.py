@@ -101,12 +101,17 @@ def filled(planes: Planes, patches: Patches, echoes: Echoes) -> Patches:
 
 
 def bounding(planes: Planes, patches: Patches, echoes: Echoes) -> list[int]:
-    """The planes of some size behind which lie neither receivers nor transmitter nor, but for one in fifty, echoes."""
+    """The planes of some size behind which lie neither receivers nor transmitter nor, but for one in fifty, echoes.
+
+    Echoes behind a plane must be fewer than those on it, too: a few places in a corner make a plane that cuts it off.
+    """
     ends = torch.cat((echoes.receivers, echoes.tx[None]))
     ahead = ends @ planes.normals.mT - planes.offsets
     side = ahead.mean(0).sign()
-    beyond = (echoes.points @ planes.normals.mT - planes.offsets) * side < -REACH
-    alone = ((ahead * side < 0).double().mean(0) <= STRAY) & (beyond.double().mean(0) <= STRAY)
+    beyond = ((echoes.points @ planes.normals.mT - planes.offsets) * side < -REACH).sum(0)
+    owner = owner_of(planes, patches, echoes.points, REACH)
+    own = torch.bincount(owner[owner >= 0], minlength=len(planes))
+    alone = ((ahead * side < 0).double().mean(0) <= STRAY) & (beyond <= STRAY * len(echoes)) & (beyond < own)
     return torch.nonzero((patches.areas >= BOUND) & alone).squeeze(-1).tolist()
 
 
