@@ -8,14 +8,14 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose, matrix_from_quaternion
 from rf3dgs.core.grids import Camera, pinhole_grid
 from rf3dgs.data.photo import Photo
-from rf3dgs.geometry.planes import directions_of, find_planes
+from rf3dgs.geometry.planes import find_planes, main_directions
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.image_loss import psnr
 from rf3dgs.training.config import VisualConfig
 from rf3dgs.training.initial import camera_box, random_start, upright, views_of
 from rf3dgs.training.photographs import blending_weights, clamp_needles, depth_error, render_photo
 from rf3dgs.training.schedule import Schedule
-from rf3dgs.training.sweep import Surfaces, swept_surfaces
+from rf3dgs.training.sweep import Surfaces, View, swept_surfaces, upheld
 from rf3dgs.training.visual import VisualStage, fit_geometry
 
 SMALL = VisualConfig(
@@ -158,6 +158,26 @@ def test_swept_points_lie_on_the_wall_that_was_photographed():
     assert len(found.thinned(500, torch.Generator().manual_seed(0)).points) == 500
 
 
+def test_a_depth_counts_where_other_photographs_see_it_and_not_past_it():
+    views = []
+    for side in (-0.5, 0.0, 0.5):
+        camera = Camera.of(Pose.look_at((0.0, side, 0.0), (4.0, side, 0.0)), pinhole_grid(40, 30, 60))
+        view = View(camera, torch.zeros(30, 40, 3))
+        view.depth = torch.full((30, 40), 4.0)  # of the wall at x = 4
+        views.append(view)
+    everywhere = torch.ones(30, 40, dtype=torch.bool)
+    middle = views[1]
+    middle.depth[:15] = 2.0
+    others = [(views[0], everywhere), (views[2], everywhere)]
+    held = upheld(middle, everywhere, others)
+    inner = torch.zeros_like(everywhere)
+    inner[:, 6:34] = True  # what both others have in their pictures, too
+    assert not bool(held[:15].any())
+    assert bool(held[15:][inner[15:]].all())
+    assert not bool(upheld(middle, everywhere, [(view, ~everywhere) for view, _ in others]).any())
+    assert not bool(upheld(middle, ~everywhere, others).any())
+
+
 def test_large_planes_are_found_among_scattered_points():
     generator = torch.Generator().manual_seed(0)
     floor, wall = torch.rand(2, 1500, 3, generator=generator) * 6
@@ -169,7 +189,21 @@ def test_large_planes_are_found_among_scattered_points():
     order = normals[:, 2].argsort(descending=True)
     assert torch.allclose(normals[order], torch.tensor([[0.0, 0, 1], [1, 0, 0]]), atol=0.02)
     assert torch.allclose(planes.offsets.abs()[order], torch.tensor([0.0, 5.0]), atol=0.05)
-    assert len(directions_of(planes, 1)) == 1 < len(directions_of(planes, 4))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_main_directions_are_those_of_a_turned_room(seed):
+    generator = torch.Generator().manual_seed(seed)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=generator)).Q
+    points = torch.rand(8000, 3, generator=generator) * torch.tensor([9.0, 7.0, 3.0])
+    wall = torch.randint(5, (8000,), generator=generator)  # the fifth are scattered
+    for number, (axis, height) in enumerate(((0, 0.0), (1, 0.0), (1, 7.0), (2, 0.0))):
+        points[wall == number, axis] = height
+    points = (points + 0.1 * torch.randn(points.shape, generator=generator)) @ turn
+    found = main_directions(points, 0.1, generator)
+    assert torch.allclose(found @ found.mT, torch.eye(3), atol=1e-5)
+    assert float((found @ turn.mT).abs().amax(-1).min()) > math.cos(math.radians(0.5))
+    assert torch.equal(main_directions(points[:30], 0.1, generator), torch.zeros(0, 3))
 
 
 def test_flattened_gaussians_turn_their_shortest_axis_to_the_normal():

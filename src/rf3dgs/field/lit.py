@@ -26,6 +26,7 @@ from typing import Literal
 
 import torch
 from torch import Tensor
+from torch.nn.functional import embedding
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import View
@@ -218,10 +219,15 @@ class LitSurface:
         return incidence(self.means, self.normals, self.tx)
 
     @cached_property
+    def _law(self) -> Tensor:
+        """The law `[N, 5]` of each Gaussian's segment."""
+        return _each(self.laws, self.segment_of)
+
+    @cached_property
     def _arriving(self) -> Tensor:
         """The lit power `[N]` where the lobe is 1."""
         distance, cosine, _ = self._geometry
-        law = self.laws[self.segment_of]
+        law = self._law
         return self.visibility * 10 ** (law[:, 0] / 10) * torch.exp(law[:, 1] * cosine) / distance**2
 
     @cached_property
@@ -230,11 +236,11 @@ class LitSurface:
 
     @cached_property
     def _lobe(self) -> Tensor:
-        return self.laws[self.segment_of, 2]
+        return self._law[:, 2]
 
     @cached_property
     def _ambient_power(self) -> Tensor:
-        law = self.laws[self.segment_of]
+        law = self._law
         level_db = law[:, 3] + law[:, 4] * 10 * torch.log10(self._geometry[0] / AMBIENT_DISTANCE)
         if self.ambient_shift is not None:
             level_db = level_db + self.ambient_shift[self.cell_of]
@@ -243,12 +249,12 @@ class LitSurface:
     @cached_property
     def _harmonics(self) -> Tensor:
         """The residual's coefficients `[N, 16, 1]`, all levels together."""
-        return combined(self.segment_sh[self.segment_of], self.cell_sh[self.cell_of], self.level)
+        return combined(_each(self.segment_sh, self.segment_of), _each(self.cell_sh, self.cell_of), self.level)
 
     @cached_property
     def _csi(self) -> Tensor:
         """The coefficients `[N, 9, 4]` of the residual of delay and departure, all levels together."""
-        total = self.segment_csi[self.segment_of] + self.cell_csi[self.cell_of]
+        total = _each(self.segment_csi, self.segment_of) + _each(self.cell_csi, self.cell_of)
         total[:, 0] += self.own_csi / C0
         return total.contiguous()
 
@@ -273,6 +279,14 @@ def incidence(means: Tensor, normals: Tensor, tx: Tensor) -> tuple[Tensor, Tenso
     cosine = (normals * towards).sum(-1)
     mirrored = 2 * cosine[:, None] * normals - towards
     return distance, cosine.clamp_min(LEAST_COSINE), mirrored
+
+
+def _each(groups: Tensor, group_of: Tensor) -> Tensor:
+    """The row `[N, ...]` of `groups` `[G, ...]` to which each Gaussian belongs.
+
+    Gradients are summed over groups by `embedding`, which adds in the same order every time.
+    """
+    return embedding(group_of, groups.flatten(1)).unflatten(1, groups.shape[1:])
 
 
 def combined(segment: Tensor, cell: Tensor, level: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample
+from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, grid_sample
 
 from rf3dgs.core.grids import Camera
 from rf3dgs.geometry.patches import Patches
@@ -28,6 +28,7 @@ GRAZING = 0.2  # cosine below which a photograph sees a plane too flatly
 OFF_DEPTH = 0.05  # a photograph that draws another depth, by this share, shows another colour
 HIDDEN = 0.85  # what is drawn nearer than this share of the plane's distance hides it
 MOST_PHOTOS = 16
+LEVELS = 5  # of the pictures, each half as large as the one before
 MARGIN = 0.5  # what lies this far beside a patch, within the site, is looked at too [m]
 SWEEP = 0.06  # [m]
 ROUNDS = 3
@@ -47,12 +48,12 @@ TILT_COST = 0.004  # and what a tilt must gain for each degree: from afar and fr
 @dataclass(frozen=True, eq=False)
 class Sight:
     """A photograph as the refinement needs it: camera, picture (bytes `[row, col, 3]`), the same in grey (0 to 1,
-    `[row, col]`), and the depth that is drawn there `[row, col]` [m].
+    `[row, col]`) at full, half, quarter ... size, and the depth that is drawn there `[row, col]` [m].
     """
 
     camera: Camera
     picture: Tensor
-    grey: Tensor
+    greys: tuple[Tensor, ...]
     depth: Tensor
 
     @classmethod
@@ -60,7 +61,16 @@ class Sight:
         """The photograph, with the depth of the Gaussians."""
         raster = draw(gaussians, camera, depth=True, compositing=Compositing(depth_gate=0.3, normalise=True))
         depth = torch.where(raster.weight > OPEN, raster.values[..., -1], NOTHING)
-        return cls(camera, picture, picture.float().mean(-1) / 255.0, depth)
+        greys = [picture.float().mean(-1) / 255.0]
+        while len(greys) < LEVELS:
+            rows, columns = greys[-1].shape
+            greys.append(adaptive_avg_pool2d(greys[-1][None], ((rows + 1) // 2, (columns + 1) // 2))[0])
+        return cls(camera, picture, tuple(greys), depth)
+
+    def grey_for(self, depth: Tensor) -> Tensor:
+        """The picture in grey with pixels about as large as a `STEP` on what lies at depths `depth` [m]."""
+        pixels = STEP * float(self.camera.K[0, 0]) / max(float(depth.median()), STEP)
+        return self.greys[min(max(0, round(math.log2(pixels))), LEVELS - 1)]
 
 
 def refine_planes(
@@ -213,8 +223,11 @@ def _compared(sights: Sequence[Sight], points: Tensor, normal: Tensor) -> tuple[
     """
     total, squares, count, views = (torch.zeros(points.shape[:2]) for _ in range(4))
     for sight in sights:
-        where, _, _, seen = _seen(sight, points, normal)
-        values = grid_sample(sight.grey[None, None], where[None], align_corners=False, padding_mode="border")[0, 0]
+        where, z, _, seen = _seen(sight, points, normal)
+        if not bool(seen.any()):
+            continue
+        grey = sight.grey_for(z[seen])[None, None]
+        values = grid_sample(grey, where[None], align_corners=False, padding_mode="border")[0, 0]
         mean = _window(values)
         spread = (_window(values.square()) - mean.square()).clamp_min(0.0).sqrt()
         clear = seen & (spread > LEAST_CONTRAST) & (_window(seen.float()) > 0.99)

@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding
 
 from rf3dgs.field.lit import CSI_HARMONICS, LARGEST_RESIDUAL_DB, LitSurface
 from rf3dgs.field.rays import Rays
@@ -53,31 +52,8 @@ def picture(surface: LitSurface, found: Mapping[str, Tensor], one: JointView, ba
 
     `found`: the numbers of `SCALES`, in which it is differentiable; all else is the surface's and the view's.
     """
-    values = _alone(surface, found).values(one.view.position, csi=one.has_csi)
+    values = replace(surface, **found).values(one.view.position, csi=one.has_csi)
     return surface.seen(values, one.view, backend) + one.sources
-
-
-def _alone(surface: LitSurface, found: Mapping[str, Tensor]) -> LitSurface:
-    """The surface with the numbers that were found, in which every Gaussian is a segment of its own.
-
-    Gradients are summed over segments and cells by `embedding`, which adds in the same order every time.
-    """
-
-    def spread(name: str, group: Tensor) -> Tensor:
-        return embedding(group, found[name].flatten(1)).unflatten(1, found[name].shape[1:])
-
-    return replace(
-        surface,
-        segment_of=torch.arange(len(surface)),
-        cell_of=torch.zeros_like(surface.cell_of),
-        laws=spread("laws", surface.segment_of),
-        segment_sh=spread("segment_sh", surface.segment_of) + spread("cell_sh", surface.cell_of),
-        cell_sh=torch.zeros_like(surface.cell_sh[:1]),
-        level=found["level"],
-        segment_csi=spread("segment_csi", surface.segment_of) + spread("cell_csi", surface.cell_of),
-        cell_csi=torch.zeros_like(surface.cell_csi[:1]),
-        own_csi=found["own_csi"],
-    )
 
 
 def loss_of(

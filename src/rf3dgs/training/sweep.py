@@ -2,37 +2,38 @@
 
 A small copy of each photograph is compared with others from some way off on trial planes (normalised
 cross-correlation of windows), in three rounds: planes that face the camera, in even steps of inverse depth; planes
-along the normals of the large planes found so far, on which floors and ceilings seen at a flat angle match as well;
-and those large planes themselves, which fill what is left between clear pixels. A depth counts where the depth map of
-another photograph confirms it. Collins (1996), "A space-sweep approach to true multi-image matching"; Gallup et al.
-(2007), "Real-time plane-sweeping stereo with multiple sweeping directions".
+along the three directions that most of what was found so far faces, on which floors, ceilings and walls seen at a flat
+angle match as well; and the large planes of each direction, which fill what is left between clear pixels. A depth
+counts where more depth maps of other photographs have it than look past it. Collins (1996), "A space-sweep approach to
+true multi-image matching"; Gallup et al. (2007), "Real-time plane-sweeping stereo with multiple sweeping directions".
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
 from rf3dgs.core.grids import Camera
-from rf3dgs.geometry.planes import Planes, directions_of, find_planes
+from rf3dgs.geometry.planes import Planes, find_planes, main_directions
 from rf3dgs.training.photographs import shrunk
 
 PIXELS_ACROSS = 107
 DEPTHS = 80
 FINER = 4
 NEAREST = 0.04
-NEIGHBOURS = 4
+NEIGHBOURS, WITNESSES = 4, 16
 BASELINE = 0.08
 WINDOW = 7
 CORRELATION = 0.7
 LEAST_CONTRAST = 0.012
 AGREEMENT = 0.05
-DIRECTIONS = 4
-PLANES = 16
-TOLERANCE = 0.005
+PLANES = 8  # of one direction
+POINTS, POINTS_OF_PLANES = 20_000, 6000
+TOLERANCE = 0.005  # of the farthest depth
 FILL_CORRELATION = 0.35
+FACING = 0.9999  # cosine; what a round found has its direction itself
 
 
 class View:
@@ -107,15 +108,35 @@ def sweep(view: View, partners: Sequence[View], inverse: Tensor, slope: Tensor, 
 
 def confirmed(view: View, partners: Sequence[View]) -> Tensor:
     """Where `[row, col]` the view's depth is clear and another view has the same."""
-    points = view.unproject(view.depth).reshape(-1, 3)
+    points = view.world.reshape(-1, 3)
     agrees = torch.zeros(len(points), dtype=torch.bool)
     for other in partners:
-        pixel, inside = project(other.camera, points)
-        col, row = pixel.long().clamp_min(0).unbind(-1)
-        row, col = row.clamp_max(other.camera.height - 1), col.clamp_max(other.camera.width - 1)
-        z = points @ other.camera.viewmat[2, :3] + other.camera.viewmat[2, 3]
-        agrees |= inside & ((other.depth[row, col] - z).abs() < AGREEMENT * z) & (other.score[row, col] > CORRELATION)
+        inside, place, depth = met(other, points)
+        same = (other.depth[place] - depth).abs() < AGREEMENT * depth
+        agrees |= inside & same & (other.score[place] > CORRELATION)
     return agrees.reshape(view.depth.shape) & (view.score > CORRELATION) & view.textured
+
+
+def upheld(view: View, known: Tensor, others: Sequence[tuple[View, Tensor]]) -> Tensor:
+    """Where `[row, col]` what is `known` of the view's depth is seen by more of the others than look past it.
+
+    The others come with what is known of theirs.
+    """
+    points = view.world.reshape(-1, 3)
+    balance = torch.zeros(len(points))
+    for other, mask in others:
+        inside, place, depth = met(other, points)
+        told, apart = inside & mask[place], other.depth[place] / depth.clamp_min(1e-6) - 1
+        balance += (told & (apart.abs() < AGREEMENT)).float() - (told & (apart > 2 * AGREEMENT)).float()
+    return known & (balance > 0).reshape(known.shape)
+
+
+def met(other: View, points: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor], Tensor]:
+    """Who of world points `[point, 3]` is in another view's picture, in which row and column, and how deep [m]."""
+    pixel, inside = project(other.camera, points)
+    col, row = pixel.long().clamp_min(0).unbind(-1)
+    place = row.clamp_max(other.camera.height - 1), col.clamp_max(other.camera.width - 1)
+    return inside, place, points @ other.camera.viewmat[2, :3] + other.camera.viewmat[2, 3]
 
 
 @dataclass(frozen=True)
@@ -136,11 +157,14 @@ class Surfaces:
         areas = [view.depth[mask].square() for view, mask in zip(views, known, strict=True)]
         return cls(torch.cat(points), torch.cat(normals), torch.cat(colours), torch.cat(areas))
 
+    def only(self, chosen: Tensor) -> "Surfaces":
+        """Some of them, by a mask or list."""
+        return Surfaces(*(getattr(self, field.name)[chosen] for field in fields(self)))
+
     def thinned(self, count: int, generator: torch.Generator) -> "Surfaces":
         """At most `count` of the points, evenly over the area."""
         kept = (self.areas / torch.rand(len(self.areas), generator=generator).log().neg()).argsort(descending=True)
-        kept = kept[:count]
-        return Surfaces(self.points[kept], self.normals[kept], self.colours[kept], self.areas[kept])
+        return self.only(kept[:count])
 
 
 def swept_surfaces(
@@ -154,23 +178,37 @@ def swept_surfaces(
         View(*shrunk(c, p, max(1, round(c.width / PIXELS_ACROSS)))) for c, p in zip(cameras, pictures, strict=True)
     ]
     inverse = torch.linspace(1 / far, 1 / (NEAREST * far), DEPTHS)
-    partners = [[views[other] for other in _partners(views, index, far)] for index in range(len(views))]
+    beside = [_beside(views, index, far) for index in range(len(views))]
+    partners = [[views[other] for other in others[:NEIGHBOURS]] for others in beside]
     pairs = [(view, others) for view, others in zip(views, partners, strict=True) if others]
     for view, others in pairs:
         sweep(view, others, inverse, torch.ones_like(view.grey), None)
     found = Surfaces.of(views, [confirmed(view, others) for view, others in zip(views, partners, strict=True)])
-    planes = find_planes(found.thinned(6000, generator).points, TOLERANCE * far, PLANES, generator)
-    for direction in directions_of(planes, DIRECTIONS):
+    directions = main_directions(found.thinned(POINTS, generator).points, TOLERANCE * far, generator)
+    for direction in directions:
         for view, others in pairs:
             slope = view.slopes(direction[None])[0]
             sweep(view, others, inverse, slope.abs().clamp_min(1e-3), direction)
     sure = [confirmed(view, others) for view, others in zip(views, partners, strict=True)]
-    found = Surfaces.of(views, sure)
-    planes = find_planes(found.thinned(6000, generator).points, 0.5 * TOLERANCE * far, PLANES, generator)
+    planes = _planes_along(directions, Surfaces.of(views, sure), 0.5 * TOLERANCE * far, generator)
     known = []
     for view, others, mask in zip(views, partners, sure, strict=True):
         known.append(mask | _fill(view, others, planes, mask, far) if others and len(planes) else mask)
-    return views, known
+    return views, [
+        upheld(view, mask, [(views[other], known[other]) for other in others])
+        for view, mask, others in zip(views, known, beside, strict=True)
+    ]
+
+
+def _planes_along(directions: Tensor, found: Surfaces, tolerance: float, generator: torch.Generator) -> Planes:
+    """The large planes of what faces each of the `directions` `[direction, 3]`."""
+    normals, offsets = [torch.zeros(0, 3)], [torch.zeros(0)]
+    for direction in directions:
+        facing = found.only((found.normals @ direction).abs() > FACING).thinned(POINTS_OF_PLANES, generator)
+        planes = find_planes(facing.points, tolerance, PLANES, generator)
+        normals.append(planes.normals)
+        offsets.append(planes.offsets)
+    return Planes(torch.cat(normals), torch.cat(offsets))
 
 
 def _fill(view: View, partners: Sequence[View], planes: Planes, sure: Tensor, far: float) -> Tensor:
@@ -187,10 +225,10 @@ def _fill(view: View, partners: Sequence[View], planes: Planes, sure: Tensor, fa
     return filled
 
 
-def _partners(views: Sequence[View], index: int, far: float) -> list[int]:
-    """The views that share most with view `index`, counted over a coarse grid of depths, from `BASELINE` of `far` away.
+def _beside(views: Sequence[View], index: int, far: float) -> list[int]:
+    """At most `WITNESSES` views that share most with view `index`, counted over a coarse grid of depths.
 
-    Nearer ones show depth less: they count by the square of their distance.
+    Those nearer than `BASELINE` of `far` [m] show depth less: they count by the square of their distance.
     """
     own = views[index].camera
     probe = View(own.resized(12, 9), torch.zeros(9, 12, 3))
@@ -203,7 +241,7 @@ def _partners(views: Sequence[View], index: int, far: float) -> list[int]:
         inside = project(view.camera, points)[1].float().mean()
         apart = min(1.0, moved / (BASELINE * far)) ** 2
         scores.append(apart * float(inside) if other != index and facing > 0.3 else 0.0)
-    order = sorted(range(len(views)), key=lambda other: -scores[other])[:NEIGHBOURS]
+    order = sorted(range(len(views)), key=lambda other: -scores[other])[:WITNESSES]
     return [other for other in order if scores[other] > 0.05]
 
 
