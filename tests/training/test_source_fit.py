@@ -21,10 +21,10 @@ from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
-from rf3dgs.training.consolidation import squared, surface_points
+from rf3dgs.training.consolidation import oblique_planes, squared, surface_points
 from rf3dgs.training.marks import Paint, fit_marks
 from rf3dgs.training.radio_views import ruled
-from rf3dgs.training.reflection import Glints, fit_reflection, glints, on_time, ray_powers
+from rf3dgs.training.reflection import Glints, fit_reflection, glints, on_time, ray_powers, silent_planes
 from rf3dgs.training.source_fit import GATES, _gated, fit_sources
 from rf3dgs.training.timed_mirrors import timed_mirrors
 
@@ -349,9 +349,11 @@ def test_small_planes_that_nearly_stand_square_do():
     one, other = sorted((int(square.plane_of[6]), int(square.plane_of[7])))
     assert one == other  # 5 cm apart and facing one way: one thing
     assert sorted(square.patches.areas[6:8].tolist())[0] == 0.0
+    assert oblique_planes(planes, patches).tolist() == [False] * 8 + [True]
     alone = Planes(normals[6:], offsets)
     unknown = replace(room, planes=alone, patches=Patches.of(alone, points))
     assert squared(unknown) is unknown  # no wall says what is square
+    assert not bool(oblique_planes(unknown.planes, unknown.patches).any())
 
 
 def test_marks_are_left_out_where_planes_are_uniform(fitted):
@@ -382,6 +384,20 @@ def test_a_mirror_that_is_nowhere_seen_falls_silent(spectra):
     fit = fit_sources(spectra, surfaces, FREE, Pose(TX), SourceConfig(refine=False, complete=False))
     assert fit.sources.mirrors.tolist() == [True] * 6 + [False]
     assert not bool((fit.sources.sequence == 6).any())
+
+
+def test_an_oblique_plane_mirrors_only_if_it_was_seen_to():
+    """A wall seen ten times, a square plane and an oblique one of which nobody tells, and oblique ones that were seen
+    at two of three and at one of two positions.
+    """
+    asked, heard = torch.tensor([10, 0, 0, 3, 2]), torch.tensor([10, 0, 0, 2, 1])
+    found = peaks_at(torch.zeros(15, 3), torch.full((15,), -10.0))
+    plane = found.plane.clone()
+    plane[:, 0] = torch.repeat_interleave(torch.arange(5), asked)
+    seen = torch.cat([torch.arange(int(a)) < h for a, h in zip(asked, heard, strict=True)])
+    found = replace(found, plane=plane, seen=seen)
+    oblique = torch.tensor([False, False, True, True, True])
+    assert silent_planes(found, 5, oblique).tolist() == [False, False, True, False, True]
 
 
 def _spots(surfaces: Surfaces, plane: int) -> torch.Tensor:

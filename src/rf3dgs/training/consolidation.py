@@ -111,3 +111,14 @@ def squared(surfaces: Surfaces) -> Surfaces:
     ]
     plane_of = torch.where(surfaces.plane_of >= 0, whole[surfaces.plane_of.clamp_min(0)], -1)
     return replace(surfaces, planes=planes, patches=Patches.of(planes, flat, patches.cell), plane_of=plane_of)
+
+
+def oblique_planes(planes: Planes, patches: Patches) -> Tensor:
+    """True `[plane]` for planes that face no large one's way, within 7 degrees; none where no plane is large.
+
+    Photographs make some where none is.
+    """
+    walls = planes.normals[patches.areas >= LARGE]
+    if not len(walls):
+        return torch.zeros(len(planes), dtype=torch.bool)
+    return ((planes.normals @ walls.mT).abs() < SQUARE_ANGLE).all(-1)

@@ -190,12 +190,15 @@ def _design(found: Glints, count: int) -> Tensor:
     return design[:, :count].reshape(len(found), 3 * count)
 
 
-def silent_planes(found: Glints, count: int) -> Tensor:
-    """True `[count]` for planes whose images were looked for and mostly not seen."""
+def silent_planes(found: Glints, count: int, oblique: Tensor) -> Tensor:
+    """True `[count]` for planes whose images were looked for and mostly not seen.
+
+    An `oblique` `[count]` one must have been seen, by more positions than looked for it in vain.
+    """
     single = found.only(found.alone & (found.order == 1))
     asked = torch.bincount(single.plane[:, 0], minlength=count)
     heard = torch.bincount(single.plane[single.seen, 0], minlength=count)
-    return (asked >= SILENT_LEAST) & (heard < SILENT_SHARE * asked)
+    return torch.where(oblique, 2 * heard <= asked, (asked >= SILENT_LEAST) & (heard < SILENT_SHARE * asked))
 
 
 def law_levels(found: Glints, reflection: Tensor) -> Tensor:

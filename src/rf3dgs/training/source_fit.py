@@ -16,7 +16,7 @@ from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
-from rf3dgs.training.consolidation import consolidated, squared, with_skins
+from rf3dgs.training.consolidation import consolidated, oblique_planes, squared, with_skins
 from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
 from rf3dgs.training.marks import Paint, fit_marks
 from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_reflection, glints, silent_planes, silent_sources
@@ -101,7 +101,8 @@ def fit_sources(
     rays = sources.rays_each(positions, obstacles, in_sight=seen)
     found = glints(sources, rays, spectra)
     sources = replace(sources, reflection=fit_reflection(found, len(sources.planes)))
-    silent = silent_planes(found, len(sources.planes))
+    assert sources.patches is not None
+    silent = silent_planes(found, len(sources.planes), oblique_planes(sources.planes, sources.patches))
     sources = with_images(sources, probes, replace(config, order=min(config.order, TOLD_BY)), silent=silent)
     rays = sources.rays_each(positions, obstacles, in_sight=seen)
     found = glints(sources, rays, spectra)
