@@ -3,7 +3,7 @@
 A small copy of each photograph is compared with others from some way off on trial planes (normalised
 cross-correlation of windows), in three rounds: planes that face the camera, in even steps of inverse depth; planes
 along the three directions that most of what was found so far faces, on which floors, ceilings and walls seen at a flat
-angle match as well; and the large planes of each direction, which fill what is left between clear pixels. A depth
+angle match as well; and the large planes that bound the site, which fill what is left between clear pixels. A depth
 counts where more depth maps of other photographs have it than look past it. Collins (1996), "A space-sweep approach to
 true multi-image matching"; Gallup et al. (2007), "Real-time plane-sweeping stereo with multiple sweeping directions".
 """
@@ -33,6 +33,7 @@ PLANES = 8  # of one direction
 POINTS, POINTS_OF_PLANES = 20_000, 6000
 TOLERANCE = 0.005  # of the farthest depth
 FILL_CORRELATION = 0.35
+BEHIND, STRAY = 4.0, 0.05  # tolerances behind a plane, and share of what may be there
 FACING = 0.9999  # cosine; what a round found has its direction itself
 
 
@@ -190,7 +191,7 @@ def swept_surfaces(
             slope = view.slopes(direction[None])[0]
             sweep(view, others, inverse, slope.abs().clamp_min(1e-3), direction)
     sure = [confirmed(view, others) for view, others in zip(views, partners, strict=True)]
-    planes = _planes_along(directions, Surfaces.of(views, sure), 0.5 * TOLERANCE * far, generator)
+    planes = _bounding_planes(directions, Surfaces.of(views, sure), 0.5 * TOLERANCE * far, generator)
     known = []
     for view, others, mask in zip(views, partners, sure, strict=True):
         known.append(mask | _fill(view, others, planes, mask, far) if others and len(planes) else mask)
@@ -200,14 +201,19 @@ def swept_surfaces(
     ]
 
 
-def _planes_along(directions: Tensor, found: Surfaces, tolerance: float, generator: torch.Generator) -> Planes:
-    """The large planes of what faces each of the `directions` `[direction, 3]`."""
+def _bounding_planes(directions: Tensor, found: Surfaces, tolerance: float, generator: torch.Generator) -> Planes:
+    """The large planes of what faces each of the `directions` `[direction, 3]`, on one side of which nearly all lies.
+
+    Others are small things' and would be drawn far beside them.
+    """
     normals, offsets = [torch.zeros(0, 3)], [torch.zeros(0)]
     for direction in directions:
         facing = found.only((found.normals @ direction).abs() > FACING).thinned(POINTS_OF_PLANES, generator)
         planes = find_planes(facing.points, tolerance, PLANES, generator)
-        normals.append(planes.normals)
-        offsets.append(planes.offsets)
+        height = (facing.points @ planes.normals.mT - planes.offsets) / tolerance
+        beyond = torch.minimum((height > BEHIND).float().mean(0), (height < -BEHIND).float().mean(0))
+        normals.append(planes.normals[beyond < STRAY])
+        offsets.append(planes.offsets[beyond < STRAY])
     return Planes(torch.cat(normals), torch.cat(offsets))
 
 
