@@ -107,11 +107,12 @@ def fit_network(field: RadioField, views: Sequence[LitView], floor_db: float) ->
     torch.manual_seed(SEED)
     made = WithNetwork(field, Network(field.surface))
     nn.init.zeros_(made.network.layers[-1].weight)
+    hits = [field.surface.hit_in(one.view) for one in views]
     for steps in STEPS:
         rows = []
-        for one in views:
+        for one, hit in zip(views, hits, strict=True):
             receiver = one.view.position
-            lacking = shortfall(made.at(receiver), [one], floor_db)
+            lacking = shortfall(made.at(receiver), [one], [hit], floor_db)
             along = view_directions(field.surface.means[lacking.gaussian], receiver)
             with torch.no_grad():
                 target = lacking.error_db + made.network(lacking.gaussian, along)

@@ -9,10 +9,10 @@ import torch
 
 from rf3dgs.core.errors import DataError, InputError
 from rf3dgs.core.frames import Pose, quaternion_from_matrix
-from rf3dgs.core.grids import equirect_grid, list_grid
+from rf3dgs.core.grids import equirect_grid, list_grid, view_of
 from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.field.io import _digest, load_field
-from rf3dgs.field.lit import LitSurface
+from rf3dgs.field.lit import OF_EACH, LitSurface
 from rf3dgs.field.radiance import Surface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.spectra.codec import DbWindow
@@ -285,6 +285,31 @@ def test_a_file_of_before_delay_and_departure_had_a_residual_loads_without_one(t
     assert isinstance(older, LitSurface)
     assert float(older.own_csi.abs().max()) == 0.0
     assert older.lobe == 0.0
+
+
+def test_a_cell_of_two_segments_is_refused():
+    surface = floor(0.5)
+    halves = (surface.means[:, 0] > 0).long()
+    two = {name: torch.cat([getattr(surface, name)] * 2) for name in ("laws", "segment_sh", "segment_csi")}
+    with pytest.raises(InputError, match="a cell must lie in one segment; cell 0 has Gaussians of several"):
+        replace(surface, segment_of=halves, **two)
+
+
+def test_a_picture_needs_only_the_gaussians_that_it_shows():
+    generator = torch.Generator().manual_seed(2)
+    surface = floor(0.2)
+    hidden = replace(surface, means=surface.means - torch.tensor([0.0, 0.0, 1.0]))  # under the floor
+    both = {name: torch.cat((getattr(surface, name), getattr(hidden, name))) for name in OF_EACH}
+    both["level"] = torch.randn(2 * len(surface), generator=generator)
+    surface = replace(surface, lobe=0.05, **both)
+    view = view_of(Pose([0.3, -0.2, 1.5]), equirect_grid(60, 30))
+    hit = surface.hit_in(view)
+    assert 0.3 < float(hit.float().mean()) < 0.7
+    part = surface.subset(hit)
+    assert len(part) == int(hit.sum())
+    assert torch.equal(part.picture(view), surface.picture(view))
+    again = surface.subset(hit.nonzero().squeeze(-1))
+    assert torch.equal(again.level, part.level)
 
 
 @pytest.mark.parametrize(

@@ -91,7 +91,7 @@ def drawn(count: int, seed: int) -> tuple[Spectrum, list]:
         delay=torch.ones(count, *GRID.shape),
         aod=torch.ones(count, *GRID.shape, 3),
     )
-    views = joint_views(empty, rays, unit=surface.unit, floor_db=FLOOR_DB)
+    views = joint_views(surface, empty, rays, floor_db=FLOOR_DB)
     shown = torch.stack([picture(surface, numbers(surface), one) for one in views])
     return replace(
         empty,
@@ -121,7 +121,7 @@ def wrong() -> LitSurface:
 
 
 def misfit_of(surface: LitSurface, spectra: Spectrum, rays: list) -> float:
-    views = joint_views(spectra, rays, unit=surface.unit, floor_db=FLOOR_DB)
+    views = joint_views(surface, spectra, rays, floor_db=FLOOR_DB)
     return sum(float(misfit(picture(surface, numbers(surface), one), one)) for one in views)
 
 
@@ -139,7 +139,7 @@ def refined(training, **changes) -> LitSurface:
 def test_a_picture_is_the_surface_and_the_point_sources(training):
     spectra, rays = training
     surface = walls()
-    (one,) = joint_views(spectra[:1], rays[:1], unit=surface.unit, floor_db=FLOOR_DB)
+    (one,) = joint_views(surface, spectra[:1], rays[:1], floor_db=FLOOR_DB)
     assert len(rays[0]) == 7
     shown = picture(surface, numbers(surface), one)[..., 0] * surface.unit
     apart = rays[0].picture(spectra.pose[0], GRID, LOBE) + surface.picture(one.view, csi=False)[..., 0] * surface.unit
@@ -152,7 +152,7 @@ def test_a_picture_is_the_surface_and_the_point_sources(training):
 def test_the_gradient_of_the_loss_is_that_of_finite_differences(training, lobe):
     spectra, rays = training
     surface = replace(wrong(), lobe=lobe)
-    (view,) = joint_views(spectra[:1], rays[:1], unit=surface.unit, floor_db=FLOOR_DB)
+    (view,) = joint_views(surface, spectra[:1], rays[:1], floor_db=FLOOR_DB)
     one: JointView = doubles(view)
     surface = doubles(surface)
     start = {name: x.double() for name, x in numbers(surface).items()}
@@ -209,7 +209,7 @@ def test_levels_up_to_a_floor_are_all_one(training):
     spectra, rays = training
     surface = walls()
     high = replace(spectra, floor=torch.full_like(spectra.power, float(spectra.power.max())))
-    (one,) = joint_views(high[:1], rays[:1], unit=surface.unit, floor_db=FLOOR_DB)
+    (one,) = joint_views(surface, high[:1], rays[:1], floor_db=FLOOR_DB)
     shown = picture(surface, numbers(surface), one)
     assert float(misfit(0.1 * shown, one)) == 0.0
     assert float(misfit(10 * shown, one)) > 0.0

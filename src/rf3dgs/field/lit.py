@@ -35,7 +35,7 @@ from rf3dgs.field.beam import through_lobe
 from rf3dgs.field.radiance import NANOSECOND, Radiance, bounce
 from rf3dgs.spectra.codec import DbWindow
 from rf3dgs.splats.compositing import Compositing
-from rf3dgs.splats.harmonics import C0, evaluate, view_directions
+from rf3dgs.splats.harmonics import evaluate, view_directions
 from rf3dgs.splats.raster import Raster
 from rf3dgs.splats.rasterize import Backend, rasterize
 
@@ -47,6 +47,11 @@ CSI_DEGREE = 2
 CSI_HARMONICS = (CSI_DEGREE + 1) ** 2
 LAW = ("level_db", "incidence", "lobe", "ambient_db", "falloff")
 """Columns of `LitSurface.laws`: R [dB at 1 m], b, alpha, A [dB at 5 m], e."""
+OF_EACH = (
+    *("means", "quats", "log_scales", "logit_opacities", "normals", "visibility"),
+    *("segment_of", "cell_of", "level", "ambient", "own_csi"),
+)
+"""What a `LitSurface` has one row of for each Gaussian."""
 LARGEST_RESIDUAL_DB = 12.0
 AMBIENT_DISTANCE = 5.0  # [m], where the ambient level is stated
 LEAST_COSINE = 0.01
@@ -59,7 +64,7 @@ class LitSurface:
 
     means `[N, 3]` [m], quats `[N, 4]`, log_scales `[N, 3]`, logit_opacities `[N]`: as in `Gaussians`, without colour.
     normals `[N, 3]`: unit vectors to the free side. visibility `[N]`: transmittance to the transmitter, baked.
-    segment_of, cell_of `[N]` long: the segment 0..S-1 and the cell 0..C-1 of each Gaussian.
+    segment_of, cell_of `[N]` long: the segment 0..S-1 and the cell 0..C-1 of each Gaussian; a cell is in one segment.
     laws `[S, 5]`: R, b, alpha, A, e of each segment (`LAW`).
     segment_sh `[S, 16]`, cell_sh `[C, 16]`, level `[N]`: the residual E [dB], harmonics of the direction from the
         receiver to the Gaussian and a level.
@@ -127,6 +132,12 @@ class LitSurface:
                     f"{name} must number 0..{most - 1}; got {int(number.min())} to {int(number.max())}: every Gaussian "
                     "belongs to one"
                 )
+        astray = self.segment_of_cell[self.cell_of] != self.segment_of
+        if bool(astray.any()):
+            raise InputError(
+                f"a cell must lie in one segment; cell {int(self.cell_of[astray][0])} has Gaussians of several. Number "
+                "cells anew in each segment"
+            )
 
     def __len__(self) -> int:
         return len(self.means)
@@ -150,6 +161,24 @@ class LitSurface:
     def unit(self) -> float:
         """The linear power that counts as 1 in a picture's channels: the window's ceiling."""
         return 10.0 ** (self.window.ceil_db / 10)
+
+    @cached_property
+    def segment_of_cell(self) -> Tensor:
+        """The segment `[C]` of each cell; 0 where it has no Gaussian."""
+        segment = torch.zeros(len(self.cell_sh), dtype=torch.long, device=self.cell_of.device)
+        return segment.index_put((self.cell_of,), self.segment_of)
+
+    def subset(self, chosen: Tensor) -> "LitSurface":
+        """The surface of the Gaussians that a mask `[N]` or an index `chosen` keeps; groups keep their numbers."""
+        index = chosen.nonzero().squeeze(-1) if chosen.dtype == torch.bool else chosen
+        return replace(self, **{name: getattr(self, name).index_select(0, index) for name in OF_EACH})
+
+    def hit_in(self, view: View, backend: Backend = "auto") -> Tensor:
+        """True `[N]` for the Gaussians that a pixel of `view` shows; a `subset` of these has the same picture."""
+        values = torch.ones(len(self), 1).requires_grad_()
+        with torch.enable_grad():
+            shown = self._raster(values, view, backend).values
+            return torch.autograd.grad(shown.sum(), values)[0].squeeze(-1) > 0
 
     def picture(self, view: View, *, csi: bool = True, backend: Backend = "auto") -> Tensor:
         """The channels `[row, col, 2 (+ 4)]` described above, without gradients; `csi=False` gives the first two."""
@@ -182,14 +211,14 @@ class LitSurface:
         departure vector, `[N, 1 (+ 4)]`."""
         directions = view_directions(self.means, receiver)
         lit, ambient = self.parts(directions)
-        factor = power_factor(evaluate(self._harmonics, directions)[:, 0]) / self.unit
+        factor = power_factor(evaluate(self._harmonics, directions)[:, 0] + self.level) / self.unit
         lit, ambient = lit * factor, ambient * factor
         power = (lit + ambient)[:, None]
         if not csi:
             return power
         late = torch.linalg.vector_norm(self.means - receiver, dim=-1) / (SPEED_OF_LIGHT * NANOSECOND)
         weighted = lit[:, None] * self._bounce + ambient[:, None] * self.ambient
-        weighted += power * evaluate(self._csi, directions)
+        weighted += power * (evaluate(self._csi, directions) + self.own_csi)
         weighted[:, 0] += power[:, 0] * late
         return torch.cat((power, weighted), -1)
 
@@ -248,15 +277,13 @@ class LitSurface:
 
     @cached_property
     def _harmonics(self) -> Tensor:
-        """The residual's coefficients `[N, 16, 1]`, all levels together."""
-        return combined(_each(self.segment_sh, self.segment_of), _each(self.cell_sh, self.cell_of), self.level)
+        """The coefficients `[N, 16, 1]` of the residual's harmonics, of segments and cells together."""
+        return _each(self.cell_sh + _each(self.segment_sh, self.segment_of_cell), self.cell_of)[..., None]
 
     @cached_property
     def _csi(self) -> Tensor:
-        """The coefficients `[N, 9, 4]` of the residual of delay and departure, all levels together."""
-        total = _each(self.segment_csi, self.segment_of) + _each(self.cell_csi, self.cell_of)
-        total[:, 0] += self.own_csi / C0
-        return total.contiguous()
+        """The coefficients `[N, 9, 4]` of the residual of delay and departure, of segments and cells together."""
+        return _each(self.cell_csi + _each(self.segment_csi, self.segment_of_cell), self.cell_of)
 
     @cached_property
     def _bounce(self) -> Tensor:
@@ -282,18 +309,11 @@ def incidence(means: Tensor, normals: Tensor, tx: Tensor) -> tuple[Tensor, Tenso
 
 
 def _each(groups: Tensor, group_of: Tensor) -> Tensor:
-    """The row `[N, ...]` of `groups` `[G, ...]` to which each Gaussian belongs.
+    """The row `[N, ...]` of `groups` `[G, ...]` to which each Gaussian, or each cell, belongs.
 
     Gradients are summed over groups by `embedding`, which adds in the same order every time.
     """
     return embedding(group_of, groups.flatten(1)).unflatten(1, groups.shape[1:])
-
-
-def combined(segment: Tensor, cell: Tensor, level: Tensor) -> Tensor:
-    """Coefficients `[N, 16, 1]` of the residual from those of segments and cells `[N, 16]` and levels `[N]` [dB]."""
-    total = segment + cell
-    total[:, 0] += level / C0
-    return total[..., None].contiguous()
 
 
 def power_factor(residual_db: Tensor) -> Tensor:

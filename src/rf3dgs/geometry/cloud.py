@@ -55,6 +55,14 @@ class Cloud:
         bounded = torch.where(opaque, mass.clamp_max(float(mass.quantile(0.98))), 0.0)
         return cls(gaussians.means, normals, bounded, spots, cell)
 
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def part(self, chosen: Tensor) -> "Cloud":
+        """The cloud of the Gaussians that a mask keeps; its cells stay as wide."""
+        parts = {name: getattr(self, name)[chosen] for name in ("points", "normals", "mass", "spots")}
+        return replace(self, **parts)
+
     def lies(self, plane: Found) -> Tensor:
         """True `[gaussian]` within the tolerances of a plane; an angle above 90 degrees: all but edge-on ones."""
         near = ((self.points @ plane.normal - plane.offset).abs() < plane.tolerance) & (self.mass > 0)
@@ -106,12 +114,11 @@ def fitted(points: Tensor, mass: Tensor, along: Tensor) -> tuple[Tensor, Tensor]
     return normal.float(), (normal @ centre).float()
 
 
-def sharpness(cloud: Cloud, plane: Found, main: Tensor) -> float:
-    """Mass of the Gaussians `main` over that of all with the same normal within 4 tolerances, above the same cells."""
-    beside = cloud.lies(replace(plane, tolerance=4 * plane.tolerance))
-    patch = cloud.patch(plane.normal, cloud.points[main])
-    beside[beside.clone()] = patch.holds(cloud.points[beside], torch.zeros(int(beside.sum()), dtype=torch.long))
-    return float(cloud.mass[main].sum() / cloud.mass[beside | main].sum())
+def sharpness(cloud: Cloud, plane: Found, main: Cloud) -> float:
+    """Mass of `main`, which lies on a plane, over that of all within 4 of its tolerances, above the same cells."""
+    beside = cloud.lies(replace(plane, tolerance=4 * plane.tolerance)).nonzero().squeeze(-1)
+    above = cloud.patch(plane.normal, main.points).holds(cloud.points[beside], torch.zeros_like(beside))
+    return float(main.mass.sum() / cloud.mass[beside[above]].sum())
 
 
 def bends(points: Tensor, mass: Tensor, plane: Found) -> bool:

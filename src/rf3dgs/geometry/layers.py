@@ -8,7 +8,7 @@ fifth of its thickness or so.
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -26,8 +26,8 @@ SAME_DIRECTION = 0.996  # cosine of 5 degrees
 HAZE_DIRECTION = 0.966  # cosine of 15 degrees
 
 
-def find_layers(cloud: Cloud, rest: Tensor, found: Sequence[Found], config: SurfaceConfig) -> list[Found]:
-    """Walls among Gaussians `rest` whose normals say nothing: layers `config.layer` thick to either side.
+def find_layers(cloud: Cloud, rest: Cloud, found: Sequence[Found], config: SurfaceConfig) -> list[Found]:
+    """Walls among `rest`, a part of the cloud whose normals say nothing: layers `config.layer` thick to either side.
 
     Directions are those of the planes found and a fan of those that are square to the largest. The offset at which the
     mass most exceeds what lies beside it is a layer, where it covers `config.min_layer_area` that way.
@@ -35,53 +35,53 @@ def find_layers(cloud: Cloud, rest: Tensor, found: Sequence[Found], config: Surf
     layers: list[Found] = []
     if not found or config.layer <= 0:
         return layers
-    rest = rest.clone()
-    directions = _fan(found)
+    axes = [_Axis.of(cloud, direction, config.layer / BINS) for direction in _fan(found)]
+    total = float(cloud.mass.sum())
     for _ in range(2 * MOST_LAYERS):
-        if len(layers) == MOST_LAYERS or int(rest.sum()) < 3:
+        if len(layers) == MOST_LAYERS or len(rest) < 3:
             break
-        seed = _thickest(cloud, rest, directions, config.layer)
+        seed = _thickest(rest, axes, config.layer)
         if seed is None:
             break
         layer = seed
         for _ in range(REFINEMENTS):
-            main = cloud.pieces(layer.normal, rest & cloud.lies(layer))[0]
+            main = rest.pieces(layer.normal, rest.lies(layer))[0]
             if int(main.sum()) < 3:
                 break
-            points, mass = cloud.points[main], cloud.mass[main]
+            points, mass = rest.points[main], rest.mass[main]
             normal = squared(fitted(points, mass, layer.normal)[0], found[0].normal)
             layer = replace(layer, normal=normal, offset=(mass * (points @ normal)).sum() / mass.sum())
-        kept, _, _ = cloud.pieces(layer.normal, rest & cloud.lies(layer))
-        area = cloud.area(layer.normal, kept)
+        kept = rest.pieces(layer.normal, rest.lies(layer))[0]
+        area = rest.area(layer.normal, kept)
         ahead = cloud.points @ layer.normal > layer.offset
-        if float(cloud.mass[ahead].sum()) < 0.5 * float(cloud.mass.sum()):
+        if float(cloud.mass[ahead].sum()) < 0.5 * total:
             layer = replace(layer, normal=-layer.normal, offset=-layer.offset)
-        if area >= config.min_layer_area and _is_layer(cloud, layer, kept, area, found, config):
+        if area >= config.min_layer_area and _is_layer(cloud, layer, rest.part(kept), area, found, config):
             layers.append(layer)
             seed = layer
         reach = 2 * seed.tolerance if any(layer is other for other in layers) else seed.tolerance
-        rest &= ((cloud.points @ seed.normal - seed.offset).abs() > reach) & ~kept
+        rest = rest.part(((rest.points @ seed.normal - seed.offset).abs() > reach) & ~kept)
     return layers
 
 
 def _is_layer(
-    cloud: Cloud, layer: Found, main: Tensor, area: float, found: Sequence[Found], config: SurfaceConfig
+    cloud: Cloud, layer: Found, main: Cloud, area: float, found: Sequence[Found], config: SurfaceConfig
 ) -> bool:
-    """Whether the Gaussians `main` cover their `area` [m^2], bound the site, stand out, and are no plane's haze."""
+    """Whether `main`, a part of the cloud, covers its `area` [m^2], bounds the site, stands out, and is no plane's
+    haze."""
     behind = cloud.points @ layer.normal < layer.offset - 2 * layer.tolerance
     if float(cloud.mass[behind].sum()) > BEHIND * float(cloud.mass.sum()):
         return False
-    mass = float(cloud.mass[main].sum())
-    wide = cloud.lies(replace(layer, tolerance=3 * layer.tolerance))
-    patch = cloud.patch(layer.normal, cloud.points[main])
-    wide[wide.clone()] = patch.holds(cloud.points[wide], torch.zeros(int(wide.sum()), dtype=torch.long))
-    centre = cloud.points[main].mean(0)
+    mass = float(main.mass.sum())
+    wide = cloud.lies(replace(layer, tolerance=3 * layer.tolerance)).nonzero().squeeze(-1)
+    above = cloud.patch(layer.normal, main.points).holds(cloud.points[wide], torch.zeros_like(wide))
+    centre = main.points.mean(0)
     for plane in found:
         alike = abs(float(plane.normal @ layer.normal)) > HAZE_DIRECTION
         near = abs(float(plane.normal @ centre - plane.offset)) < 2 * layer.tolerance
-        if alike and near and int(cloud.lies(plane).sum()) > 0.5 * int(main.sum()):
+        if alike and near and int(cloud.lies(plane).sum()) > 0.5 * len(main):
             return False
-    return mass >= config.min_cover * area and mass >= LAYER_SHARP * float(cloud.mass[wide | main].sum())
+    return mass >= config.min_cover * area and mass >= LAYER_SHARP * float(cloud.mass[wide[above]].sum())
 
 
 def squared(normal: Tensor, largest: Tensor) -> Tensor:
@@ -115,28 +115,46 @@ def _fan(found: Sequence[Found]) -> Tensor:
     return torch.cat((torch.stack([plane.normal for plane in found]), fan))
 
 
-def _thickest(cloud: Cloud, rest: Tensor, directions: Tensor, half: float) -> Found | None:
-    """The layer of +-`half` [m] at the site's bounds whose mass most exceeds that of its two neighbours' mean."""
-    best, layer = 0.0, None
-    mass = cloud.mass.double()
-    for direction in directions:
+@dataclass(frozen=True, eq=False)
+class _Axis:
+    """A direction `[3]`, where a cloud begins along it [m], the width of bins [m], and the cloud's mass below each."""
+
+    direction: Tensor
+    first: float
+    width: float
+    whole: Tensor
+
+    @classmethod
+    def of(cls, cloud: Cloud, direction: Tensor, width: float) -> "_Axis":
         away = cloud.points @ direction
         first = float(away.min())
-        bins = ((away - first) / (half / BINS)).long()
-        own, whole = _sums(bins[rest], mass[rest]), _sums(bins, mass)
-        own = torch.cat((own, own[-1:].expand(len(whole) - len(own))))
-        edge = 2 * BINS  # of the layer around bin k: sums up to k - BINS and k + BINS; neighbours as wide
+        return cls(direction, first, width, _sums(((away - first) / width).long(), cloud.mass.double()))
+
+    def below(self, part: Cloud, mass: Tensor) -> Tensor:
+        """The `mass` of a part of the cloud below each bin."""
+        own = _sums(((part.points @ self.direction - self.first) / self.width).long(), mass)
+        return torch.cat((own, own[-1:].expand(len(self.whole) - len(own))))
+
+
+def _thickest(rest: Cloud, axes: Sequence[_Axis], half: float) -> Found | None:
+    """The layer of +-`half` [m] at the site's bounds whose mass most exceeds that of its two neighbours' mean."""
+    best, layer = 0.0, None
+    mass = rest.mass.double()
+    edge = 2 * BINS  # of the layer around bin k: sums up to k - BINS and k + BINS; neighbours as wide
+    for axis in axes:
+        whole = axis.whole
         k = torch.arange(3 * BINS, len(whole) - 3 * BINS)
         if not len(k):
             continue
+        own = axis.below(rest, mass)
         inside = own[k + BINS] - own[k - BINS]
         beside = own[k + 3 * BINS] - own[k + BINS] + own[k - BINS] - own[k - 3 * BINS]
         behind = torch.minimum(whole[k - edge], whole[-1] - whole[k + edge])
         excess = torch.where(behind < BEHIND * whole[-1], inside - 0.5 * beside, 0.0)
         if float(excess.max()) > best:
             best = float(excess.max())
-            offset = first + (int(k[excess.argmax()]) - 3 * BINS) * half / BINS
-            layer = Found(direction, torch.tensor(offset), half, 180.0)
+            offset = axis.first + (int(k[excess.argmax()]) - 3 * BINS) * axis.width
+            layer = Found(axis.direction, torch.tensor(offset), half, 180.0)
     return layer
 
 

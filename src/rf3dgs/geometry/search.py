@@ -38,34 +38,34 @@ def search_planes(
     """
     generator = torch.Generator().manual_seed(config.seed)
     cloud = Cloud.of(gaussians, normals, mass, config)
-    rest = cloud.mass > 0
+    rest = cloud.part(cloud.mass > 0)
     found: list[Found] = []
     failures = 0
-    while len(found) < config.max_planes and failures < FAILURES and int(rest.sum()) >= 3:
+    while len(found) < config.max_planes and failures < FAILURES and len(rest) >= 3:
         radius = NEARBY if failures % 2 else math.inf
-        seed = _refined(cloud, rest, _best(cloud, rest, radius, config, generator), config)
-        lies = rest & cloud.lies(seed)
-        kept, main, area = cloud.pieces(seed.normal, lies, config.min_width)
-        if is_plane(cloud, seed, main, area, config):
+        seed = _refined(rest, _best(rest, radius, config, generator))
+        lies = rest.lies(seed)
+        kept, main, area = rest.pieces(seed.normal, lies, config.min_width)
+        if is_plane(cloud, seed, rest.part(main), area, config):
             plane = _loosened(cloud, rest, seed, area, config)
             found.append(plane)
             if plane.tolerance > seed.tolerance:
-                kept = cloud.pieces(plane.normal, rest & cloud.lies(plane), config.min_width)[0]
-            rest &= ~kept
+                kept = rest.pieces(plane.normal, rest.lies(plane), config.min_width)[0]
+            rest = rest.part(~kept)
             failures = 0
         else:
-            rest &= ~(main if bool(main.any()) else lies)
+            rest = rest.part(~(main if bool(main.any()) else lies))
             failures += 1
     layers = find_layers(cloud, rest, found, config)
     return settled(cloud, without_haze(cloud, found, layers), config)
 
 
-def _best(cloud: Cloud, rest: Tensor, radius: float, config: SurfaceConfig, generator: torch.Generator) -> Found:
+def _best(rest: Cloud, radius: float, config: SurfaceConfig, generator: torch.Generator) -> Found:
     """The candidate, through a Gaussian along its normal, on which most mass lies within `radius` [m] of it."""
-    index = rest.nonzero().squeeze(-1)
+    index = torch.arange(len(rest))
     if len(index) > SAMPLE:
-        index = index[torch.randperm(len(index), generator=generator)[:SAMPLE]]
-    points, directions, mass = cloud.points[index], cloud.normals[index], cloud.mass[index]
+        index = torch.randperm(len(index), generator=generator)[:SAMPLE]
+    points, directions, mass = rest.points[index], rest.normals[index], rest.mass[index]
     trial = torch.multinomial(mass, TRIALS, replacement=True, generator=generator)
     normals = directions[trial]
     offsets = (normals * points[trial]).sum(-1)
@@ -77,34 +77,35 @@ def _best(cloud: Cloud, rest: Tensor, radius: float, config: SurfaceConfig, gene
     return Found(normals[best], offsets[best], config.tolerance, config.angle_deg)
 
 
-def _refined(cloud: Cloud, rest: Tensor, plane: Found, config: SurfaceConfig) -> Found:
+def _refined(rest: Cloud, plane: Found) -> Found:
     """The plane fitted to the largest piece that lies on it, weighted by mass, a few times over."""
+    before = torch.zeros(0)
     for _ in range(REFINEMENTS):
-        main = cloud.pieces(plane.normal, rest & cloud.lies(plane))[1]
-        if int(main.sum()) < 3:
+        main = rest.pieces(plane.normal, rest.lies(plane))[1]
+        if int(main.sum()) < 3 or torch.equal(main, before):
             break
-        normal, offset = fitted(cloud.points[main], cloud.mass[main], plane.normal)
-        plane = replace(plane, normal=normal, offset=offset)
+        normal, offset = fitted(rest.points[main], rest.mass[main], plane.normal)
+        plane, before = replace(plane, normal=normal, offset=offset), main
     return plane
 
 
-def _loosened(cloud: Cloud, rest: Tensor, plane: Found, area: float, config: SurfaceConfig) -> Found:
+def _loosened(cloud: Cloud, rest: Cloud, plane: Found, area: float, config: SurfaceConfig) -> Found:
     """The plane with twice the tolerance, again and again, as long as its largest piece grows by `GROWTH` that way."""
     while 2 * plane.tolerance <= config.max_tolerance:
-        wider = _refined(cloud, rest, replace(plane, tolerance=2 * plane.tolerance), config)
-        _, main, larger = cloud.pieces(wider.normal, rest & cloud.lies(wider))
+        wider = _refined(rest, replace(plane, tolerance=2 * plane.tolerance))
+        _, main, larger = rest.pieces(wider.normal, rest.lies(wider))
         same = float(wider.normal @ plane.normal) > SAME_DIRECTION
-        if larger < GROWTH * area or not same or not is_plane(cloud, wider, main, larger, config):
+        if larger < GROWTH * area or not same or not is_plane(cloud, wider, rest.part(main), larger, config):
             break
         plane, area = wider, larger
     return plane
 
 
-def is_plane(cloud: Cloud, plane: Found, main: Tensor, area: float, config: SurfaceConfig) -> bool:
-    """Whether the Gaussians `main`, a piece of `area` [m^2], make a surface; see the head of this file."""
-    if int(main.sum()) < config.min_count or area < config.min_area:
+def is_plane(cloud: Cloud, plane: Found, main: Cloud, area: float, config: SurfaceConfig) -> bool:
+    """Whether `main`, a piece of `area` [m^2] of the cloud, makes a surface; see the head of this file."""
+    if len(main) < config.min_count or area < config.min_area:
         return False
-    points, mass = cloud.points[main], cloud.mass[main]
+    points, mass = main.points, main.mass
     if widths(points, plane_axes(plane.normal[None])[0])[1] < config.min_width:
         return False
     if float(mass.sum()) < config.min_cover * area:

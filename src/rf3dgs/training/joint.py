@@ -52,8 +52,8 @@ def picture(surface: LitSurface, found: Mapping[str, Tensor], one: JointView, ba
 
     `found`: the numbers of `SCALES`, in which it is differentiable; all else is the surface's and the view's.
     """
-    values = replace(surface, **found).values(one.view.position, csi=one.has_csi)
-    return surface.seen(values, one.view, backend) + one.sources
+    part = replace(surface, **found).subset(one.hit)
+    return part.seen(part.values(one.view.position, csi=one.has_csi), one.view, backend) + one.sources
 
 
 def loss_of(
@@ -89,7 +89,7 @@ def refine_jointly(
     rays: what reaches each position from point sources. The closed form's values are start and prior. Without
     `residual` only laws move. `seed` decides the order of positions.
     """
-    views = joint_views(spectra, rays, unit=surface.unit, floor_db=floor_db)
+    views = joint_views(surface, spectra, rays, floor_db=floor_db, backend=backend)
     start = {name: getattr(surface, name) for name in ("laws", *RESIDUAL)}
     still = (() if residual else RESIDUAL) + (() if views[0].has_csi else CSI)
     moved = {name: torch.zeros_like(x).requires_grad_() for name, x in start.items() if name not in still}

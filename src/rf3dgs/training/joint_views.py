@@ -9,9 +9,11 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from rf3dgs.core.grids import View, view_of
+from rf3dgs.field.lit import LitSurface
 from rf3dgs.field.radiance import NANOSECOND
 from rf3dgs.field.rays import Rays
 from rf3dgs.spectra.spectrum import Spectrum
+from rf3dgs.splats.rasterize import Backend
 from rf3dgs.training.lit_fit import SOFT_DB
 from rf3dgs.training.lit_views import SOFT_NS, SOFT_TURN
 
@@ -25,10 +27,11 @@ class JointView:
     view: what it shows. worth `[row, col]`: solid angle of a pixel relative to the picture's mean, zero where nothing
     was measured. truth `[row, col, 1 (+ 4)]`: power over the surface's unit, delay [ns] and departure. floor
     `[row, col]`: power over the unit up to which levels are all one. sources `[row, col, 1 (+ 4)]`: power over the unit
-    of point sources, and that times delay [ns] and departure.
+    of point sources, and that times delay [ns] and departure. hit `[N]`: True for the Gaussians that it shows.
     """
 
     view: View
+    hit: Tensor
     worth: Tensor
     truth: Tensor
     floor: Tensor
@@ -40,12 +43,16 @@ class JointView:
         return self.truth.shape[-1] > 1
 
 
-def joint_views(spectra: Spectrum, rays: Sequence[Rays], *, unit: float, floor_db: float) -> list[JointView]:
-    """The views of `spectra` `[position, row, col]` with the `rays` to each; levels under `floor_db` are all one."""
-    return [_view(spectra[number], one, unit, floor_db) for number, one in enumerate(rays)]
+def joint_views(
+    surface: LitSurface, spectra: Spectrum, rays: Sequence[Rays], *, floor_db: float, backend: Backend = "auto"
+) -> list[JointView]:
+    """The views of a `surface` as `spectra` `[position, row, col]` have them, with the `rays` to each; levels under
+    `floor_db` are all one."""
+    return [_view(surface, spectra[number], one, floor_db, backend) for number, one in enumerate(rays)]
 
 
-def _view(one: Spectrum, rays: Rays, unit: float, floor_db: float) -> JointView:
+def _view(surface: LitSurface, one: Spectrum, rays: Rays, floor_db: float, backend: Backend) -> JointView:
+    unit, view = surface.unit, view_of(one.pose, one.grid)
     floor = torch.zeros_like(one.power) if one.floor is None else torch.where(one.looked, one.floor, torch.zeros(()))
     told = one.looked & ((one.power > 0) | (floor > 0))
     truth = (one.power / unit)[..., None]
@@ -56,7 +63,8 @@ def _view(one: Spectrum, rays: Rays, unit: float, floor_db: float) -> JointView:
     place, ray, share = rays.shares(one.pose, one.grid, one.instrument)
     sent = (share / unit)[:, None] * known[ray]
     return JointView(
-        view=view_of(one.pose, one.grid),
+        view=view,
+        hit=surface.hit_in(view, backend),
         worth=one.grid.solid_angle / one.grid.solid_angle.mean() * told,
         truth=truth,
         floor=(floor / unit).clamp_min(10 ** (floor_db / 10) / unit),

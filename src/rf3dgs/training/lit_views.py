@@ -140,27 +140,31 @@ def observe(geometry: Gaussians, views: Sequence[LitView], *, unit: float, backe
     )
 
 
-def shortfall(surface: LitSurface, views: Sequence[LitView], floor_db: float, backend: Backend = "auto") -> Shortfall:
+def shortfall(
+    surface: LitSurface, views: Sequence[LitView], hits: Sequence[Tensor], floor_db: float, backend: Backend = "auto"
+) -> Shortfall:
     """What `surface` lacks in `views`, thrown back onto the Gaussians by their share in each pixel's power.
 
-    The share is the derivative of a pixel's level in a Gaussian's. Levels under `floor_db`, or a pixel's own floor,
-    count as that.
+    The share is the derivative of a pixel's level in a Gaussian's. hits: which Gaussians each view shows
+    (`LitSurface.hit_in`). Levels under `floor_db`, or a pixel's own floor, count as that.
     """
     has_csi = all(view.channels.shape[-1] == 5 for view in views)
     rows = []
-    for number, one in enumerate(views):
+    for number, (one, hit) in enumerate(zip(views, hits, strict=True)):
+        part = surface.subset(hit)
         with torch.no_grad():
-            values = surface.values(one.view.position, csi=has_csi)
+            values = part.values(one.view.position, csi=has_csi)
             sent = values[:, :1]
             # The weights do not depend on what is blended: channels beyond the model's own bring back more sums.
             values = torch.cat((values, sent.expand(-1, 3 if has_csi else 1)), -1).requires_grad_()
         with torch.enable_grad():
-            shown = surface.seen(values, one.view, backend)
+            shown = part.seen(values, one.view, backend)
             upstream = _lacking(shown.detach(), one, surface.unit, floor_db)
             (sums,) = torch.autograd.grad(shown, values, upstream)
         sums = sums * sent
-        chosen = (sums[:, 0] > LEAST_WEIGHT).nonzero().squeeze(-1)
-        rows.append((chosen, torch.full_like(chosen, number), sums[chosen]))
+        chosen = sums[:, 0] > LEAST_WEIGHT
+        gaussian = hit.nonzero().squeeze(-1)[chosen]
+        rows.append((gaussian, torch.full_like(gaussian, number), sums[chosen]))
     gaussian, view, sums = _joined(rows)
     level = (gaussian, view, sums[:, 0].contiguous(), sums[:, 1] / sums[:, 0])
     if not has_csi:

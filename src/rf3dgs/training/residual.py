@@ -48,8 +48,9 @@ def refine_residual(
     """
     receivers = torch.stack([one.view.position for one in views])
     groups = Groups.of(surface)
+    hits = [surface.hit_in(one.view, backend) for one in views] if passes else []
     for _ in range(passes):
-        surface = _corrected(surface, receivers, groups, shortfall(surface, views, floor_db, backend))
+        surface = _corrected(surface, receivers, groups, shortfall(surface, views, hits, floor_db, backend))
     return surface
 
 
@@ -63,9 +64,8 @@ class Groups:
     @classmethod
     def of(cls, surface: LitSurface) -> "Groups":
         """Those of a surface; a cube holds cells of one segment."""
-        cells, where = len(surface.cell_sh), surface.cell_of
-        segment = torch.zeros(cells, dtype=torch.long).index_put((where,), surface.segment_of)
-        rows = where[:, None].expand(-1, 3)
+        cells, segment = len(surface.cell_sh), surface.segment_of_cell
+        rows = surface.cell_of[:, None].expand(-1, 3)
         least = torch.full((cells, 3), torch.inf).scatter_reduce(0, rows, surface.means, "amin")
         most = torch.full((cells, 3), -torch.inf).scatter_reduce(0, rows, surface.means, "amax")
         width = 2 * float((most - least).max().clamp_min(1e-3))

@@ -134,14 +134,13 @@ def _doubt(surface: LitSurface, tables: _Tables, spectra: Spectrum, places: list
     cells = tables.cells[places].sum(0)
     everywhere = cells.sum(0)
     typical = everywhere[1] / everywhere[0].clamp_min(1e-9)
-    segment_of = torch.zeros(len(cells), dtype=torch.long).index_put((surface.cell_of,), surface.segment_of)
-    segments = torch.zeros(len(surface.laws), 2).index_add_(0, segment_of, cells)
+    segments = torch.zeros(len(surface.laws), 2).index_add_(0, surface.segment_of_cell, cells)
     segment = _drawn(segments, typical, SHRINK)
     planes = tables.planes[places].sum(0)
     receivers = spectra.pose.position[places]
     apart = torch.cdist(receivers, receivers) + torch.diag(torch.full((len(receivers),), torch.inf))
     return Uncertainty(
-        spread_db=_drawn(cells, segment[segment_of], SHRINK).sqrt(),
+        spread_db=_drawn(cells, segment[surface.segment_of_cell], SHRINK).sqrt(),
         source_db=_drawn(planes, planes[:, 1].sum() / planes[:, 0].sum().clamp_min(1e-9), RAY_SHRINK).sqrt(),
         receivers=receivers,
         seen=seen[:, places],
