@@ -200,18 +200,20 @@ def test_a_mirror_reflects_only_where_it_has_surface():
             assert (1 in rays.order.tolist()) == bool((point[:2] < 3.0).all())
 
 
-def test_reach_answers_as_patches_do():
-    generator = torch.Generator().manual_seed(5)
-    planes = box_planes()
-    points = [torch.rand(30, 3, generator=generator) * SIZE for _ in range(6)]
-    points = [
-        part - ((part @ n) - d)[:, None] * n for part, n, d in zip(points, planes.normals, planes.offsets, strict=True)
-    ]
-    patches = Patches.of(planes, points)
-    asked = torch.rand(3000, 3, generator=generator) * SIZE
-    plane = torch.randint(6, (3000,), generator=generator)
-    answer = Reach.of(patches).holds(asked.double().numpy(), plane.numpy())
-    assert answer.tolist() == patches.holds(asked, plane).tolist()
+def test_reach_closes_gaps_and_keeps_outlines():
+    """A plate of 10 by 6 cells: its slit, two cells wide, closes; its notch, three cells wide, stays."""
+    floor = Planes(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1))
+    cells = torch.cartesian_prod(torch.arange(6.0), torch.arange(10.0))
+    slit = ((cells[:, 1] == 3) | (cells[:, 1] == 4)) & (cells[:, 0] > 0)
+    notch = (cells[:, 1] >= 6) & (cells[:, 1] <= 8) & (cells[:, 0] > 2)
+    axes = plane_axes(floor.normals)[0]
+    reach = Reach.of(Patches.of(floor, [(0.1 * cells[~slit & ~notch] + 0.05) @ axes]))
+    asked = torch.cartesian_prod(torch.arange(-3.0, 9.0), torch.arange(-3.0, 13.0))
+    held = reach.holds(((0.1 * asked + 0.05) @ axes).double().numpy(), np.zeros(len(asked), dtype=np.int64))
+    row, column = asked.T
+    plate = (row >= 0) & (row < 6) & (column >= 0) & (column < 10)
+    open_notch = (column >= 6) & (column <= 8) & (row > 2)
+    assert held.tolist() == (plate & ~open_notch).tolist()
 
 
 def test_reach_is_empty_far_beyond_its_cells():
@@ -219,7 +221,7 @@ def test_reach_is_empty_far_beyond_its_cells():
     reach = Reach.of(Patches.of(floor, [torch.tensor([[0.05, 0.05, 0.0], [0.15, 0.05, 0.0]])]))
     local = np.array([[0.05, 0.05], [0.05, 0.15], [0.05, 0.25], [1e15, 0.05], [-1e15, -1e15]])
     points = local @ plane_axes(floor.normals)[0].double().numpy()
-    assert reach.holds(points, np.zeros(5, dtype=np.int64)).tolist() == [True, True, False, False, False]
+    assert reach.holds(points, np.zeros(5, dtype=np.int64)).tolist() == [True, False, False, False, False]
 
 
 def test_many_receivers_get_what_each_gets_alone(monkeypatch):

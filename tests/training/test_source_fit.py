@@ -13,6 +13,7 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid
 from rf3dgs.field.images import sequences
+from rf3dgs.field.rays import RAY_FIELDS, Rays
 from rf3dgs.field.sources import PointSources
 from rf3dgs.geometry import Patches, Planes, Surfaces
 from rf3dgs.propagation.room import shoebox
@@ -24,9 +25,10 @@ from rf3dgs.training.config import SourceConfig
 from rf3dgs.training.consolidation import oblique_planes, squared, surface_points
 from rf3dgs.training.marks import Paint, fit_marks
 from rf3dgs.training.radio_views import ruled
-from rf3dgs.training.reflection import Glints, fit_reflection, glints, on_time, ray_powers, silent_planes
+from rf3dgs.training.reflection import Glints, fit_reflection, glints, on_time, outshone, ray_powers, silent_planes
 from rf3dgs.training.source_fit import GATES, _gated, fit_sources
-from rf3dgs.training.timed_mirrors import timed_mirrors
+from rf3dgs.training.timed_mirrors import timed_mirrors, with_timed
+from rf3dgs.training.virtual import Mirror
 
 SIZE = torch.tensor([9.0, 7.0, 3.2])
 TX = torch.tensor([2.1, 1.7, 2.6])
@@ -62,7 +64,7 @@ def walls(*, without: int | None = None, turned_deg: float = 0.0, moved: float =
         for high in (0, 1):
             if 2 * axis + high == without:
                 continue
-            spots = torch.rand(4000, 3, generator=generator) * SIZE
+            spots = torch.rand(20_000, 3, generator=generator) * SIZE
             spots[:, axis] = SIZE[axis] * high
             normal = torch.eye(3)[axis] * (1.0 - 2.0 * high)
             lean = torch.eye(3)[(axis + 1) % 3]
@@ -310,6 +312,52 @@ def peaks_at(places: torch.Tensor, level_db: torch.Tensor) -> Glints:
     levels = (level_db.double(), torch.full((count,), -60.0).double())
     cosine = torch.ones(count, 3, dtype=torch.float64)
     return Glints(torch.arange(count), zeros, plane, places[:, None].expand(-1, 3, 3), cosine, *levels, yes, yes)
+
+
+def test_a_law_is_that_of_most_of_a_plane_not_of_where_most_look():
+    """Twelve peaks on one door, seven all over its wall."""
+    generator = torch.Generator().manual_seed(8)
+    door = torch.tensor([6.0, 0.0, 1.2]) + 0.15 * torch.randn(12, 3, generator=generator)
+    wall = torch.stack((torch.linspace(0.5, 5.0, 7), torch.zeros(7), torch.full((7,), 1.5)), -1)
+    level = torch.cat((torch.full((12,), 0.0), torch.full((7,), -12.0)))
+    law = fit_reflection(peaks_at(torch.cat((door, wall)), level), 1)
+    assert float(law.sum()) == pytest.approx(-12.0, abs=2.0)
+
+
+def test_a_reflection_is_heard_through_a_weak_one_that_arrives_with_it(spectra, fitted):
+    """A transmitter beside a wall sends everything twice: over the wall it is the weaker."""
+    single = fitted.rays[0].only(fitted.rays[0].order == 1)
+    assert len(single) == 6
+    twin = replace(single, power=0.03 * single.power, index=single.index + 1)
+    both = Rays(*(torch.cat((getattr(single, name), getattr(twin, name))) for name in RAY_FIELDS))
+    assert outshone(both, 0.05).tolist() == [False] * 6 + [True] * 6
+    alike = replace(both, power=torch.cat((single.power, 0.3 * single.power)))
+    assert not bool(outshone(alike, 0.05).any())
+    alone = glints(fitted.sources, [single], spectra[:1])
+    together = glints(fitted.sources, [both], spectra[:1])
+    assert together.source.tolist() == alone.source.tolist()
+    torch.testing.assert_close(together.level_db, alone.level_db)
+
+
+def test_where_a_plane_has_surface_a_mirror_adds_none():
+    """A partition of 2 x 1.9 m that reflected near its top keeps its height; where it has a hole it is closed."""
+    planes = Planes(torch.tensor([[0.0, 1.0, 0.0]]), torch.zeros(1))
+    cells = torch.cartesian_prod(torch.arange(0.05, 2.0, 0.1), torch.zeros(1), torch.arange(0.05, 1.9, 0.1))
+    hole = (cells[:, 0] - 1.0).abs() < 0.4
+    patches = Patches.of(planes, [cells[~hole]])
+    sources = PointSources(
+        torch.tensor([1.0, 3.0, 2.0]), FREQUENCY, planes, patches, sequences(1, 1), torch.zeros(1, 3)
+    )
+    image = torch.tensor([1.0, -3.0, 2.0])
+
+    def seen_at(*spots: list[float]) -> Patches:
+        found = Mirror(planes.normals[0], planes.offsets[0], torch.tensor(spots), image, torch.zeros(len(spots), 3))
+        return with_timed(sources, [found])[1]
+
+    assert float(seen_at([0.3, 0.0, 1.8], [1.8, 0.0, 1.8]).areas[0]) == pytest.approx(float(patches.areas[0]))
+    filled = seen_at([0.3, 0.0, 1.8], [1.0, 0.0, 0.9])
+    assert bool(filled.holds(torch.tensor([1.0, 0.0, 0.9]), torch.tensor(0)))
+    assert float(filled.areas[0]) > float(patches.areas[0]) + 0.3
 
 
 def test_ways_of_two_reflections_tell_what_a_plane_reflects(fitted):

@@ -50,7 +50,7 @@ class Ways:
 
 @dataclass(frozen=True, eq=False)
 class Reach:
-    """Patches whose every cell beside an occupied one, corners too, is filled: one look-up answers `Patches.holds`.
+    """Patches without gaps, for one look-up a point: where ways may be reflected.
 
     axes `[P, 2, 3]` in cells, low `[P, 2]` in cells, last `[P, 2]` row and column, wide `[P]` and start `[P]` of each
     plane in cells `[cell]`. The outermost cells of a plane are empty, and stand for all beyond.
@@ -65,11 +65,13 @@ class Reach:
 
     @classmethod
     def of(cls, patches: Patches) -> "Reach":
-        """The same surface, widened by a cell."""
+        """The same surface with its gaps closed, up to two cells wide; its outline stays."""
         cells = []
         for plane in range(len(patches)):
-            grid = torch.nn.functional.pad(patches.grid(plane).float(), (3, 3, 3, 3))
-            cells.append(torch.nn.functional.max_pool2d(grid[None, None], 3, stride=1)[0, 0].flatten() > 0)
+            grid = torch.nn.functional.pad(patches.grid(plane).float(), (3, 3, 3, 3))[None, None]
+            wide = torch.nn.functional.max_pool2d(grid, 3, stride=1)
+            closed = 1 - torch.nn.functional.max_pool2d(1 - wide, 3, stride=1, padding=1)
+            cells.append(closed.flatten() > 0)
         shape = patches.shape.numpy() + 4
         sizes = shape.prod(-1)
         joined = torch.cat(cells) if cells else patches.cells
@@ -77,7 +79,7 @@ class Reach:
         return cls(axes, low, shape - 1.0, shape[:, 1], sizes.cumsum() - sizes, joined.numpy())
 
     def holds(self, points: np.ndarray, plane: np.ndarray) -> np.ndarray:
-        """True `[n]` where points `[n, 3]` [m] lie on or within a cell of the surface of their `plane` `[n]`."""
+        """True `[n]` where points `[n, 3]` [m] lie on the surface of their `plane` `[n]`."""
         local = np.einsum("nij,nj->ni", self.axes[plane], points) - self.low[plane]
         cell = np.minimum(np.maximum(local, 0.0), self.last[plane]).astype(np.int64)
         return self.cells[self.start[plane] + cell[:, 0] * self.wide[plane] + cell[:, 1]]

@@ -15,6 +15,7 @@ from rf3dgs.field.transmitter import pixel_of
 from rf3dgs.spectra.spectrum import Spectrum
 
 APART_LOBES, APART_FROM_SIGHT = 0.9, 2.0
+HIDING_DB = 10.0  # by which one of two waves that arrive as one must be stronger, to be taken for both
 LEAST_RING = 8
 HUBER_DB = 1.5
 ROUNDS = 30
@@ -22,6 +23,7 @@ COMMON = (10.0, 10.0, 10.0)  # dB by which a, b and c of one plane may differ fr
 LOOSE = (30.0, 30.0, 30.0)  # and the common ones from DIELECTRIC
 DIELECTRIC = (-6.0, -6.0, 0.0)
 SILENT_SHARE, SILENT_LEAST = 0.3, 3
+BESIDE = 0.5  # m
 DUE_DB = 3.0  # over what a peak must exceed to be seen
 LATE = 1e-9  # s; a wall that stands 10 cm off delays its reflection by less
 
@@ -61,12 +63,17 @@ class Glints:
 
 
 def glints(sources: PointSources, rays: list[Rays], spectra: Spectrum) -> Glints:
-    """The observations of all rays that were reflected at the positions of `spectra` `[position, row, col]`."""
+    """The observations of all rays that were reflected at the positions of `spectra` `[position, row, col]`.
+
+    Of waves that arrive as one those that by their laws are much the weaker ones are not looked for: a transmitter
+    beside a wall sends every reflection twice, and what is seen is the one that did not go over that wall.
+    """
     parts = []
     for position, one in enumerate(rays):
+        spectrum = spectra[position]
+        one = one.only(~outshone(one, APART_LOBES * spectrum.instrument.lobe))
         if not len(one):
             continue
-        spectrum = spectra[position]
         power, ring = ray_powers(spectrum, one.arrival)
         free = friis_gain(one.delay * SPEED_OF_LIGHT, sources.frequency) * 10 ** (sources.level_db / 10)
         apart = angle_between(one.arrival[:, None], one.arrival[None]) + torch.pi * torch.eye(len(one))
@@ -87,6 +94,12 @@ def glints(sources: PointSources, rays: list[Rays], spectra: Spectrum) -> Glints
         rows, level = torch.zeros(0, 3), torch.zeros(0, dtype=torch.float64)
         return Glints(count, count, rows.long(), torch.zeros(0, 3, 3), rows.double(), level, level, none > 0, none > 0)
     return Glints(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
+
+def outshone(rays: Rays, within: float) -> Tensor:
+    """True `[k]` for rays beside which, `within` so many radians, a ray arrives that by its law is far stronger."""
+    apart = angle_between(rays.arrival[:, None], rays.arrival[None])
+    return ((apart < within) & (rays.power > 10 ** (HIDING_DB / 10) * rays.power[:, None])).any(-1)
 
 
 def _decibels(value: Tensor) -> Tensor:
@@ -156,14 +169,16 @@ def fit_reflection(found: Glints, count: int) -> Tensor:
     """a, b and c `[count, 3]` of 10 log10 Gamma = a + b cos + c cos^2 of each plane, from isolated peaks.
 
     Huber's regression in dB, in which the reflections of a way add up. A peak of one reflection that is not seen says
-    only that it is weaker than its surroundings; of more, nothing. Planes are drawn to common values, so that one of
-    few observations keeps near them.
+    only that it is weaker than its surroundings; of more, nothing. Peaks whose reflections lie beside each other count
+    together as one: a law is that of most of a plane, not of the place that most receivers look at. Planes are drawn to
+    common values, so that one of few observations keeps near them.
     """
     start = torch.tensor(DIELECTRIC, dtype=torch.float64)
     used = found.only(found.alone & (found.seen | (found.order == 1)))
     if not len(used):
         return start.repeat(count, 1).float()
     design = _design(used, count)
+    together = _together(used)
     common, own = start, start.repeat(count, 1)
     heard = torch.zeros(count, dtype=torch.bool).index_fill(0, used.plane[used.plane >= 0], True)
     stiff = 1 / torch.tensor(COMMON, dtype=torch.float64) ** 2
@@ -172,12 +187,22 @@ def fit_reflection(found: Glints, count: int) -> Tensor:
         predicted = design @ own.reshape(-1)
         target = torch.where(used.seen, used.level_db, torch.minimum(used.limit_db, predicted))
         miss = target - predicted
-        weight = (HUBER_DB / miss.abs().clamp_min(HUBER_DB)) / (HUBER_DB * used.order) ** 2
+        weight = (HUBER_DB / miss.abs().clamp_min(HUBER_DB)) / (HUBER_DB * used.order) ** 2 / together
         left = design.mT @ (weight[:, None] * design) + torch.diag(stiff.repeat(count))
         right = design.mT @ (weight * target) + (stiff * common).repeat(count)
         own = torch.linalg.solve(left, right).reshape(count, 3)
         common = (stiff * own[heard].sum(0) + loose * start) / (stiff * int(heard.sum()) + loose)
     return own.clamp(-200, 200).float()
+
+
+def _together(found: Glints) -> Tensor:
+    """How many single reflections `[n]` lie `BESIDE` each one on its plane, itself among them; 1 for all others."""
+    number = torch.ones(len(found), dtype=torch.float64)
+    single = torch.nonzero(found.order == 1).squeeze(-1)
+    point, plane = found.point[single, 0], found.plane[single, 0]
+    near = (torch.cdist(point, point) < BESIDE) & (plane[:, None] == plane)
+    number[single] = near.sum(-1).double()
+    return number
 
 
 def _design(found: Glints, count: int) -> Tensor:

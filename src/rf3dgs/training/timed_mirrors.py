@@ -85,7 +85,7 @@ def with_timed(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, Pa
             offsets.append(mirror.offset)
             points.append(torch.zeros(0, 3))
         taken.add(plane)
-        points[plane] = torch.cat((points[plane], discs(mirror, sources.patches.cell)))
+        points[plane] = torch.cat((points[plane], discs(mirror, sources.patches, plane)))
     planes = Planes(torch.stack(normals), torch.stack(offsets))
     flat = [
         part - (part @ n - o)[:, None] * n for part, n, o in zip(points, planes.normals, planes.offsets, strict=True)

@@ -255,24 +255,29 @@ def with_mirrors(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, 
             normals.append(mirror.normal)
             offsets.append(mirror.offset)
             points.append(torch.zeros(0, 3))
-        points[place] = torch.cat((points[place], discs(mirror, sources.patches.cell)))
+        points[place] = torch.cat((points[place], discs(mirror, sources.patches, place)))
     planes = Planes(torch.stack(normals), torch.stack(offsets))
     return planes, Patches.of(planes, points, sources.patches.cell)
 
 
-def discs(mirror: Mirror, cell: float) -> Tensor:
-    """Points `[n, 3]`, a `cell` [m] apart, all over discs of surface around where a mirror was seen to reflect.
+def discs(mirror: Mirror, patches: Patches, plane: int) -> Tensor:
+    """Points `[n, 3]`, a cell apart, all over discs of surface around where a mirror was seen to reflect.
 
-    Discs reach as far as the third nearest such place, so that sparse observations still close to one surface.
+    Discs reach as far as the third nearest such place, so that sparse observations still close to one surface. Where
+    the `plane`, if it is one of the `patches`, has surface already there is none: its outline stays.
     """
+    missing = torch.ones(len(mirror.points), dtype=torch.bool)
+    if plane < len(patches):
+        missing = ~patches.holds(mirror.points, torch.tensor(plane))
     lean = torch.linalg.cross(mirror.normal, torch.eye(3)[mirror.normal.abs().argmin()])
     lean = lean / torch.linalg.vector_norm(lean)
     axes = torch.stack((lean, torch.linalg.cross(mirror.normal, lean)))
     apart = torch.cdist(mirror.points, mirror.points).sort(-1).values
     reach = apart[:, min(3, len(apart) - 1)].clamp(*DISC)
-    steps = torch.arange(-round(DISC[1] / cell), round(DISC[1] / cell) + 1.0) * cell
+    cells = round(DISC[1] / patches.cell)
+    steps = torch.arange(-cells, cells + 1.0) * patches.cell
     spots = torch.cartesian_prod(steps, steps)
-    inside = spots.norm(dim=-1) <= reach[:, None]
+    inside = (spots.norm(dim=-1) <= reach[:, None]) & missing[:, None]
     return (mirror.points[:, None] + spots @ axes)[inside]
 
 
