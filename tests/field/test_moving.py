@@ -302,7 +302,7 @@ def test_a_moved_field_comes_back_from_disk_and_moves_on(there, tmp_path):
     [
         (
             dict(tx=Pose([20.0, 2.5, 1.5])),
-            r"free space of this field; from \(20.00, 2.50, 1.50\) m 2\.\d% of the surface is lit",
+            r"free space of this field; from \(20.00, 2.50, 1.50\) m \d\.\d% of the surface is lit",
         ),
         (dict(tx=Pose(torch.ones(2, 3))), r"tx must be one pose; got a batch \[2\]"),
         (dict(tx=THERE, order=4), "order must be from 0 to 3; got 4"),
