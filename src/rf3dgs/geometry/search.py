@@ -62,10 +62,10 @@ def search_planes(
 
 def _best(rest: Cloud, radius: float, config: SurfaceConfig, generator: torch.Generator) -> Found:
     """The candidate, through a Gaussian along its normal, on which most mass lies within `radius` [m] of it."""
-    index = torch.arange(len(rest))
-    if len(index) > SAMPLE:
-        index = torch.randperm(len(index), generator=generator)[:SAMPLE]
-    points, directions, mass = rest.points[index], rest.normals[index], rest.mass[index]
+    points, directions, mass = rest.points, rest.normals, rest.mass
+    if len(rest) > SAMPLE:
+        index = torch.randperm(len(rest), generator=generator)[:SAMPLE]
+        points, directions, mass = points[index], directions[index], mass[index]
     trial = torch.multinomial(mass, TRIALS, replacement=True, generator=generator)
     normals = directions[trial]
     offsets = (normals * points[trial]).sum(-1)

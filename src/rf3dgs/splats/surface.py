@@ -18,7 +18,7 @@ from rf3dgs.splats.harmonics import C0, coefficient_count
 ALONG = 0.7  # tangential scale / spacing: at the middle of three neighbours the transmittance is 0.03
 LOOSE = 0.9  # the same on planes of only a few points, such as facets of a curved surface, where no lattice helps
 ACROSS = 0.3  # scale / spacing across an edge
-INSET = 0.42  # distance / spacing of an edge's row from the edge
+INSET = 0.42  # distance / spacing of an edge's row from the edge; nearer silhouettes stand out, farther creases leak
 JITTER = 0.1  # largest displacement / spacing of a lattice point, against moire
 SLIVER = 1e-6  # a face whose area is a smaller part of its longest side squared is left out
 CREASE = math.cos(math.radians(20))  # faces that meet at a larger angle form an edge
