@@ -1,4 +1,4 @@
-"""Paths made by hand, and a hoarder of HDF5 objects, for the tests of every layer."""
+"""Paths made by hand, a hoarder of HDF5 objects and a watch on threads, for the tests of every layer."""
 
 import math
 from contextlib import contextmanager
@@ -10,6 +10,7 @@ import torch
 from rf3dgs.channel.paths import Paths
 from rf3dgs.core.angles import angles_of
 from rf3dgs.core.frames import Pose
+from rf3dgs.core.progress import Silent
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 
 
@@ -79,6 +80,25 @@ def paths_from():
 @pytest.fixture
 def line_of_sight():
     return _line_of_sight
+
+
+class _ThreadWatch(Silent):
+    """Progress that notes on how many threads torch works."""
+
+    def __init__(self) -> None:
+        self.seen: set[int] = set()
+
+    def update(self, done: int, note: str = "") -> None:
+        self.seen.add(torch.get_num_threads())
+
+
+@pytest.fixture
+def torch_threads():
+    """Torch has three threads; a progress whose `seen` are those it had while something ran."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    yield _ThreadWatch()
+    torch.set_num_threads(before)
 
 
 @pytest.fixture

@@ -13,7 +13,8 @@ import os
 import sys
 from dataclasses import dataclass
 
-from rf3dgs.core.native import native_core, thread_count
+from rf3dgs.core.native import native_core
+from rf3dgs.core.threads import thread_count
 
 LANES = 16
 FLOAT = 4  # bytes

@@ -27,7 +27,7 @@ from benchmarks.speed.scenes import room
 from benchmarks.speed.subjects import Subject, rendering, training
 from benchmarks.speed.timing import measure
 from rf3dgs.core.files import write_whole
-from rf3dgs.core.native import thread_count
+from rf3dgs.core.threads import thread_count
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from benchmarks.speed.table import circumstances
 from benchmarks.speed.timing import Timing, measure
 from rf3dgs.cli.chain import geometry_of_mesh
 from rf3dgs.core.files import write_whole
-from rf3dgs.core.native import thread_count
+from rf3dgs.core.threads import thread_count
 from rf3dgs.propagation.sites.lobby import lobby
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.splats.surface import normals

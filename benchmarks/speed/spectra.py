@@ -27,7 +27,7 @@ from rf3dgs.channel.response import manifold
 from rf3dgs.core.files import write_whole
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid, pinhole_grid
-from rf3dgs.core.native import thread_count
+from rf3dgs.core.threads import thread_count
 from rf3dgs.spectra.beamformers import bartlett, capon, music
 from rf3dgs.spectra.config import ArrayProcessing
 from rf3dgs.spectra.covariance import covariance_of

@@ -25,7 +25,8 @@ from benchmarks.speed.floor import Machine, measure
 from benchmarks.speed.reference import Against, against_reference
 from benchmarks.speed.rows import RADIO_STEPS, ROWS, Result, time_row
 from rf3dgs.core.files import write_whole
-from rf3dgs.core.native import native_core, thread_count
+from rf3dgs.core.native import native_core
+from rf3dgs.core.threads import thread_count
 from rf3dgs.splats.rasterize import pick_backend
 
 HEADER = f"{'300x200 unless said':27}{'CPU ms':>7}{'median':>8}{'clock':>7}{'floor':>7}{'ratio':>6}{'must/goal':>10}"

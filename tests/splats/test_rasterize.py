@@ -13,7 +13,8 @@ from rf3dgs.core.cube import face_cameras
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, Panorama, equirect_grid, pinhole_grid
-from rf3dgs.core.native import native_core, thread_count
+from rf3dgs.core.native import native_core
+from rf3dgs.core.threads import thread_count
 from rf3dgs.splats import constants
 from rf3dgs.splats.compositing import Compositing
 from rf3dgs.splats.rasterize import pick_backend, rasterize

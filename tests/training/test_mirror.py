@@ -164,6 +164,11 @@ def test_the_same_spectra_give_the_same_bits(training, field):
     assert torch.equal(again.surface.cell_csi, field.surface.cell_csi)
 
 
+def test_torch_works_on_one_thread_so_that_threads_do_not_change_the_bits(training, torch_threads):
+    fit_radio(room(), training, MIRROR, progress=torch_threads)
+    assert torch_threads.seen == {1}
+
+
 def test_spectra_without_delays_leave_the_ambient_part_its_straight_way(training):
     bare = replace(training, delay=None, aod=None)
     surface = fit_radio(room(), bare[:4], MIRROR).surface

@@ -62,6 +62,11 @@ def test_the_same_seed_gives_the_same_gaussians(photos):
     assert not torch.equal(first.means[:20], other.means[:20])
 
 
+def test_torch_works_on_one_thread_so_that_threads_do_not_change_the_bits(photos, torch_threads):
+    fit_geometry(photos, dataclasses.replace(SMALL, steps=2), progress=torch_threads)
+    assert torch_threads.seen == {1}
+
+
 def test_growth_happens_where_the_gradient_is(photos):
     half_known = blobs()
     lost = dataclasses.replace(half_known, sh=half_known.sh.clone())

@@ -6,8 +6,6 @@ grid that is not the whole sphere has the forward panel only. The true covarianc
 """
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import torch
 from torch import Tensor
@@ -15,6 +13,7 @@ from torch import Tensor
 from rf3dgs.channel.arrays import PlanarArray
 from rf3dgs.channel.response import manifold
 from rf3dgs.core.grids import DirectionGrid
+from rf3dgs.core.threads import one_torch_thread
 from rf3dgs.evaluation.metrics import peak_direction
 from rf3dgs.spectra.spectrum import Spectrum
 
@@ -70,7 +69,7 @@ def beam_loss_eigen(truth: Tensor, prediction: Tensor) -> Tensor:
     loss in dB is averaged over the panels whose true covariance is not zero. A prediction of zero counts as an
     arbitrary beam, which collects the mean eigenvalue.
     """
-    with _one_thread():
+    with one_torch_thread():  # many small eigenproblems: threads would wait for each other
         best = torch.linalg.eigvalsh(truth)[..., -1]
         value, vector = torch.linalg.eigh(prediction)
     beam = vector[..., -1]
@@ -106,14 +105,3 @@ def _steered_power(truth: Spectrum, aimed: Spectrum, covariance: Tensor, array: 
     beam = manifold(array, local).to(torch.complex128)
     beam = beam / torch.linalg.vector_norm(beam, dim=-1, keepdim=True).clamp_min(1e-30)
     return (beam.conj()[..., None, :] @ covariance @ beam[..., :, None])[..., 0, 0].real
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread for many small eigenproblems: several wait for each other, the longer the busier the machine is."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

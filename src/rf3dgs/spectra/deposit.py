@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.angles import angles_of
-from rf3dgs.core.native import native_core, thread_count
+from rf3dgs.core.native import native_core
+from rf3dgs.core.threads import thread_count
 
 CHANNELS = 5
 

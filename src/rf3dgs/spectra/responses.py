@@ -17,7 +17,8 @@ from torch import Tensor
 from rf3dgs.channel.arrays import PlanarArray, ofdm
 from rf3dgs.channel.patterns import field_pattern
 from rf3dgs.channel.response import delay_phase, manifold, manifold_factors
-from rf3dgs.core.native import native_core, thread_count
+from rf3dgs.core.native import native_core
+from rf3dgs.core.threads import thread_count
 
 FEW = 4_096  # up to so many paths are summed as written
 WIDTH = 12  # cells that a path is spread over

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.grids import View
-from rf3dgs.core.native import thread_count
+from rf3dgs.core.threads import thread_count
 from rf3dgs.splats.backends import native
 from rf3dgs.splats.backends.trainer import look_arguments
 from rf3dgs.splats.compositing import Compositing

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.errors import InputError
-from rf3dgs.core.native import native_core, thread_count
+from rf3dgs.core.native import native_core
+from rf3dgs.core.threads import thread_count
 from rf3dgs.splats.transmittance import coverage, segment_transmittance
 
 SOFT_RADIUS = 0.02  # m

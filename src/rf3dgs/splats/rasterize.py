@@ -9,7 +9,8 @@ from torch import Tensor
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import Camera, Panorama, View
-from rf3dgs.core.native import native_core, native_failure, thread_count
+from rf3dgs.core.native import native_core, native_failure
+from rf3dgs.core.threads import thread_count
 from rf3dgs.splats.compositing import Compositing, finish
 from rf3dgs.splats.raster import Raster
 

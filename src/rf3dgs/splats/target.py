@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.errors import InputError
-from rf3dgs.core.native import thread_count
+from rf3dgs.core.threads import thread_count
 from rf3dgs.splats.backends import native
 
 

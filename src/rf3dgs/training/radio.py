@@ -15,6 +15,7 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid
 from rf3dgs.core.progress import Progress, Silent
+from rf3dgs.core.threads import one_torch_thread
 from rf3dgs.field.radiance import Surface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.field.transmitter import estimate_transmitter
@@ -40,6 +41,7 @@ PARTS = ("lit", "ambient", "residual", "visibility")
 MANY = 150_000  # Gaussians beyond which their level of detail is worth its pass
 
 
+@one_torch_thread()
 def fit_radio(
     geometry: Gaussians,
     spectra: Spectrum,

@@ -13,9 +13,10 @@ from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample
+from torch.nn.functional import grid_sample
 
 from rf3dgs.core.grids import Camera
+from rf3dgs.core.threads import on_threads
 from rf3dgs.geometry.planes import Planes, find_planes, main_directions
 from rf3dgs.training.photographs import shrunk
 
@@ -179,17 +180,24 @@ def swept_surfaces(
         View(*shrunk(c, p, max(1, round(c.width / PIXELS_ACROSS)))) for c, p in zip(cameras, pictures, strict=True)
     ]
     inverse = torch.linspace(1 / far, 1 / (NEAREST * far), DEPTHS)
-    beside = [_beside(views, index, far) for index in range(len(views))]
+    beside = on_threads(lambda index: _beside(views, index, far), range(len(views)))
     partners = [[views[other] for other in others[:NEIGHBOURS]] for others in beside]
     pairs = [(view, others) for view, others in zip(views, partners, strict=True) if others]
-    for view, others in pairs:
+
+    def faced(pair: tuple[View, list[View]]) -> None:
+        view, others = pair
         sweep(view, others, inverse, torch.ones_like(view.grey), None)
+
+    on_threads(faced, pairs)
     found = Surfaces.of(views, [confirmed(view, others) for view, others in zip(views, partners, strict=True)])
     directions = main_directions(found.thinned(POINTS, generator).points, TOLERANCE * far, generator)
-    for direction in directions:
-        for view, others in pairs:
-            slope = view.slopes(direction[None])[0]
-            sweep(view, others, inverse, slope.abs().clamp_min(1e-3), direction)
+
+    def turned(pair: tuple[View, list[View]]) -> None:
+        view, others = pair
+        for direction in directions:
+            sweep(view, others, inverse, view.slopes(direction[None])[0].abs().clamp_min(1e-3), direction)
+
+    on_threads(turned, pairs)
     sure = [confirmed(view, others) for view, others in zip(views, partners, strict=True)]
     planes = _bounding_planes(directions, Surfaces.of(views, sure), 0.5 * TOLERANCE * far, generator)
     known = []
@@ -252,10 +260,21 @@ def _beside(views: Sequence[View], index: int, far: float) -> list[int]:
 
 
 def window(maps: Tensor) -> Tensor:
-    """Means over square windows of `[map, row, col]`."""
-    half = WINDOW // 2
-    rows = avg_pool2d(maps[:, None], (WINDOW, 1), 1, (half, 0), count_include_pad=False)
-    return avg_pool2d(rows, (1, WINDOW), 1, (0, half), count_include_pad=False)[:, 0]
+    """Means over square windows of `[map, row, col]`, at the rim over what of the window is there."""
+    return _means_along(_means_along(maps, 1), 2)
+
+
+def _means_along(maps: Tensor, dim: int) -> Tensor:
+    """Means over `WINDOW` neighbours along one dimension, each the sum of shifted maps: torch's pooling is slower."""
+    half, size = WINDOW // 2, maps.shape[dim]
+    total = torch.zeros_like(maps)
+    for shift in range(-half, half + 1):
+        first, last = max(0, -shift), min(size, size - shift)
+        if first < last:
+            total.narrow(dim, first, last - first).add_(maps.narrow(dim, first + shift, last - first))
+    place = torch.arange(size)
+    count = (place + half).clamp_max(size - 1) - (place - half).clamp_min(0) + 1
+    return total.div_(count.to(maps.dtype).reshape((-1, 1) if dim == 1 else (-1,)))
 
 
 def project(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:

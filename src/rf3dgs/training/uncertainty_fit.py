@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.progress import Progress, Silent
+from rf3dgs.core.threads import one_torch_thread
 from rf3dgs.field.lit import LitSurface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.field.rays import Rays
@@ -55,6 +56,7 @@ class LeftOut:
     counts: Tensor
 
 
+@one_torch_thread()
 def fit_uncertainty(field: RadioField, spectra: Spectrum, *, progress: Progress | None = None) -> RadioField:
     """The mirror `field` with `uncertainty`, learned by leaving out the `spectra` `[position, row, col]` it was
     trained on, in turn.

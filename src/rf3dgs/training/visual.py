@@ -15,6 +15,7 @@ from torch import Tensor
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import Camera
 from rf3dgs.core.progress import Progress
+from rf3dgs.core.threads import one_torch_thread
 from rf3dgs.data.photo import Photo
 from rf3dgs.splats.density import Change, densify, reset_opacity, scene_extent
 from rf3dgs.splats.gaussians import Gaussians
@@ -38,6 +39,7 @@ KEPT_TARGETS = 1 << 30  # bytes; targets that need more are made anew in each it
 BYTES_OF_TARGET = 36  # a pixel of a target with its statistics
 
 
+@one_torch_thread()
 def fit_geometry(
     photos: Sequence[Photo],
     config: VisualConfig | None = None,

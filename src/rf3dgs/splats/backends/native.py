@@ -13,7 +13,8 @@ from torch.autograd.function import once_differentiable
 
 from rf3dgs.core.errors import MissingDependencyError
 from rf3dgs.core.grids import Camera, Panorama, View
-from rf3dgs.core.native import native_core, native_failure, thread_count
+from rf3dgs.core.native import native_core, native_failure
+from rf3dgs.core.threads import thread_count
 from rf3dgs.splats.projection import project_sphere
 from rf3dgs.splats.raster import Raster
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.grids import Camera, View
-from rf3dgs.core.native import thread_count
+from rf3dgs.core.threads import thread_count
 from rf3dgs.splats.backends.native import core
 from rf3dgs.splats.engine import Look, Scheme, check_whole
 from rf3dgs.splats.raster import Raster
