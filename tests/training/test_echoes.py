@@ -19,6 +19,7 @@ from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.surface import normals, sample_mesh
 from rf3dgs.training import corrected, geometry_from_spectra, radio_geometry
+from rf3dgs.training.consolidation import surface_points
 from rf3dgs.training.echo_planes import REACH, behind, bounding, filled, in_free_space, refined_by_echoes
 from rf3dgs.training.echoes import Echoes, echoes_of, merged
 
@@ -298,3 +299,39 @@ def test_wide_gaussians_leave_no_gaps_to_fill():
     added = radio_geometry.completed_by(holed, fine).means[len(holed) :]
     assert len(added) > 100
     assert float((off_the_walls(added) < 0.05).float().mean()) == 1.0
+
+
+def test_a_wall_that_echoes_tell_badly_lies_on_that_of_the_geometry():
+    """A bit of the wall x = 6, by its echoes turned by 2 degrees, and a wall behind it that geometry does not have."""
+    known = Planes(torch.tensor([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), torch.tensor([-6.0, 0.0]))
+    turn = math.radians(2.0)
+    turned = torch.tensor([-math.cos(turn), math.sin(turn), 0.0])
+    walls = Planes(torch.stack((turned, known.normals[0])), torch.tensor([-5.95, -6.6]))
+    y, z = torch.meshgrid(torch.arange(0.05, 2.0, 0.1), torch.arange(0.05, 3.0, 0.1), indexing="ij")
+    spots = torch.stack((torch.full_like(y, 6.0), y, z), -1).reshape(-1, 3)
+    points = [spots - ((spots @ walls.normals[k]) - walls.offsets[k])[:, None] * walls.normals[k] for k in (0, 1)]
+    extents = Patches.of(walls, points)
+    found, moved = radio_geometry._onto_known(walls, extents, known, torch.tensor([15.0, 18.0]))
+    assert torch.equal(found.normals[0], known.normals[0])
+    assert float(found.offsets[0]) == -6.0
+    assert torch.equal(found.normals[1], walls.normals[1])
+    assert float(found.offsets[1]) == pytest.approx(-6.6)
+    cells = surface_points(found, moved, 0)
+    assert float((cells[:, 0] - 6.0).abs().max()) < 1e-5
+    assert float(cells[:, 1].min()) < 0.2
+    assert float(cells[:, 1].max()) > 1.8
+
+
+def test_a_few_echoes_of_a_wall_do_not_spoil_it():
+    """Of the wall x = 6 few places answered, and as if it were turned by 2 degrees: nothing is laid before it."""
+    spectra = single(astray_deg=0.3)
+    _, hit = looking(receivers())
+    wall = hit[..., 0] > 5.99
+    lean = math.tan(math.radians(2.0)) * (hit[..., 1] - 0.5)
+    answers = wall & (hit[..., 1] < 1.6)
+    places = torch.where(answers[..., None], hit - lean[..., None] * torch.tensor([1.0, 0.0, 0.0]), hit)
+    directions = torch.nn.functional.normalize(places - spectra.pose.position[:, None, None], dim=-1)
+    few = spectra_by((places,), spectra.pose, directions)
+    few = replace(few, power=torch.where(wall & ~answers, 0.0, few.power))
+    found = corrected(room(0.12), few)
+    assert float((off_the_walls(found.means) < 0.05).double().mean()) > 0.99

@@ -15,14 +15,15 @@ from rf3dgs.core.grids import equirect_grid
 from rf3dgs.field.images import sequences
 from rf3dgs.field.rays import RAY_FIELDS, Rays
 from rf3dgs.field.sources import PointSources
-from rf3dgs.geometry import Patches, Planes, Surfaces
+from rf3dgs.geometry import Patches, Planes, Surfaces, find_surfaces
 from rf3dgs.propagation.room import shoebox
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
+from rf3dgs.splats.surface import sample_mesh
 from rf3dgs.training.config import SourceConfig
-from rf3dgs.training.consolidation import oblique_planes, squared, surface_points
+from rf3dgs.training.consolidation import oblique_planes, outlined, squared, surface_points
 from rf3dgs.training.marks import Paint, fit_marks
 from rf3dgs.training.radio_views import ruled
 from rf3dgs.training.reflection import Glints, fit_reflection, glints, on_time, outshone, ray_powers, silent_planes
@@ -337,6 +338,26 @@ def test_a_reflection_is_heard_through_a_weak_one_that_arrives_with_it(spectra, 
     together = glints(fitted.sources, [both], spectra[:1])
     assert together.source.tolist() == alone.source.tolist()
     torch.testing.assert_close(together.level_db, alone.level_db)
+
+
+@pytest.mark.parametrize("spacing", [0.06, 0.095])
+def test_an_outline_is_that_of_the_thing(spacing):
+    """A partition of 2 x 1.9 m whose Gaussians reach over its edges, and a mirror in its plane that nobody saw."""
+    corners = torch.tensor([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 0.0, 1.9], [0.0, 0.0, 1.9]])
+    gaussians = sample_mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), spacing=spacing)
+    surfaces = find_surfaces(gaussians, torch.tensor([[1.0, 3.0, 1.0]]))
+    unseen = torch.cartesian_prod(torch.arange(5.05, 6.0, 0.1), torch.zeros(1), torch.arange(0.05, 1.0, 0.1))
+    points = torch.cat((surface_points(surfaces.planes, surfaces.patches, 0), unseen))
+    patches = Patches.of(surfaces.planes, [points])
+    obstacles = Obstacles(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+    assert float(surface_points(surfaces.planes, patches, 0)[:, 2].max()) > 1.93
+    found = surface_points(surfaces.planes, outlined(surfaces.planes, patches, obstacles), 0)
+    own = found[found[:, 0] < 4]
+    assert float(own[:, 0].min()) > -0.03
+    assert float(own[:, 0].max()) < 2.03
+    assert float(own[:, 2].max()) < 1.93
+    assert 0.01 * len(own) == pytest.approx(3.8, abs=0.25)
+    assert 0.01 * (len(found) - len(own)) == pytest.approx(1.0, abs=0.12)
 
 
 def test_where_a_plane_has_surface_a_mirror_adds_none():

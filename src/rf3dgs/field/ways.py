@@ -16,6 +16,7 @@ from torch import Tensor
 
 from rf3dgs.field.images import HIGHEST_ORDER
 from rf3dgs.geometry import Patches
+from rf3dgs.geometry.patches import closed
 
 NEAREST = 1e-6  # share of a leg below which an end lies on the plane itself
 SHORTEST = 1e-3  # m: nearer sources count as that far
@@ -68,10 +69,7 @@ class Reach:
         """The same surface with its gaps closed, up to two cells wide; its outline stays."""
         cells = []
         for plane in range(len(patches)):
-            grid = torch.nn.functional.pad(patches.grid(plane).float(), (3, 3, 3, 3))[None, None]
-            wide = torch.nn.functional.max_pool2d(grid, 3, stride=1)
-            closed = 1 - torch.nn.functional.max_pool2d(1 - wide, 3, stride=1, padding=1)
-            cells.append(closed.flatten() > 0)
+            cells.append(torch.nn.functional.pad(closed(patches.grid(plane)), (2, 2, 2, 2)).flatten())
         shape = patches.shape.numpy() + 4
         sizes = shape.prod(-1)
         joined = torch.cat(cells) if cells else patches.cells

@@ -117,6 +117,22 @@ class Patches:
         return cls(**parts, cell=float(tensors["cell"]) if "cell" in tensors else CELL)
 
 
+def closed(grid: Tensor) -> Tensor:
+    """Cells `[row, column]` that are True with gaps closed, up to two cells wide; the outline stays."""
+    wide = widened(torch.nn.functional.pad(grid, (1, 1, 1, 1)), 1)
+    return ~widened(~wide, 1)[1:-1, 1:-1]
+
+
+def rim(grid: Tensor) -> Tensor:
+    """Cells `[row, column]` that are True and have one beside them, or beyond the grid, that is not."""
+    return grid & widened(~torch.nn.functional.pad(grid, (1, 1, 1, 1)), 1)[1:-1, 1:-1]
+
+
+def widened(grid: Tensor, cells: int) -> Tensor:
+    """Cells `[row, column]` that are True, and those up to so many `cells` beside one. Beyond the grid nothing is."""
+    return torch.nn.functional.max_pool2d(grid[None, None].float(), 2 * cells + 1, 1, cells)[0, 0] > 0
+
+
 def cell_for(scales: Tensor) -> float:
     """The width of cells [m] for Gaussians of `scales` `[gaussian, 3]` [m]: 10 cm, or wider where most are larger."""
     if not len(scales):

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from rf3dgs.geometry import Patches, Planes, Surfaces
+from rf3dgs.geometry.patches import closed, rim, widened
+from rf3dgs.splats.obstacles import Obstacles
 
 LARGE = 5.0  # m^2
 PIECE_ANGLE = 0.985  # cosine of 10 degrees
@@ -17,6 +19,9 @@ PIECE_DISTANCE = 0.25  # m
 SKIN, SKIN_ANGLE = 0.30, 0.7  # m, cosine of 45 degrees
 SQUARE_ANGLE = math.cos(math.radians(7.0))
 TOGETHER = 0.08  # m
+THROUGH = 0.2  # m to both sides of a plane, within which its Gaussians stand
+OUTSIDE = 2  # cells by which an outline may lie outside
+SOLID = 0.2  # of a ray; Gaussians reach over an edge, and a mirror that is none costs more than one that is missing
 
 
 def surface_points(planes: Planes, patches: Patches, plane: int) -> Tensor:
@@ -53,6 +58,25 @@ def consolidated(surfaces: Surfaces, means: Tensor) -> Surfaces:
     plane_of = torch.where(surfaces.plane_of >= 0, whole[surfaces.plane_of.clamp_min(0)], -1)
     joined = replace(surfaces, patches=Patches.of(planes, points, patches.cell), plane_of=plane_of)
     return replace(joined, plane_of=with_skins(joined, means))
+
+
+def outlined(planes: Planes, patches: Patches, obstacles: Obstacles) -> Patches:
+    """The patches without cells at the outlines of planes through whose middle Gaussians let pass more than `SOLID`.
+
+    Cells are found by what a Gaussian may cover, so that surface has no gaps; outlines then lie up to two cells
+    outside. Surface far from where Gaussians stand, as that of mirrors which photographs did not show, stays.
+    """
+    points = []
+    for plane in range(len(planes)):
+        middles, through = surface_points(planes, patches, plane), THROUGH * planes.normals[plane]
+        kept = patches.grid(plane)
+        solid = torch.zeros_like(kept)
+        solid[kept] = obstacles.transmittance(middles - through, middles + through, stop_short=0.0) < SOLID
+        spilled = ~solid & widened(solid, OUTSIDE)
+        for _ in range(OUTSIDE):
+            kept = kept & ~(spilled & rim(closed(kept)))
+        points.append(middles[kept[patches.grid(plane)]])
+    return Patches.of(planes, points, patches.cell)
 
 
 def with_skins(surfaces: Surfaces, means: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.splats.surface import ALONG
-from rf3dgs.training.consolidation import consolidated
+from rf3dgs.training.consolidation import PIECE_ANGLE, PIECE_DISTANCE, consolidated, surface_points
 from rf3dgs.training.echo_planes import (
     LEAST_WITNESSES,
     REGION,
@@ -87,8 +87,8 @@ def corrected(geometry: Gaussians, spectra: Spectrum, tx: Pose | None = None, *,
 
     Planes move to where their echoes lie, and what is near them and along them goes flat onto them. Other Gaussians are
     left out in places that waves were seen to cross and behind what bounds the site. Surfaces that only echoes tell of
-    are added. With fewer than 100 echoes, or without planes, nothing changes. Raises InputError for spectra without
-    delay or departure.
+    are added, in planes of the geometry where they lie on one. With fewer than 100 echoes, or without planes, nothing
+    changes. Raises InputError for spectra without delay or departure.
     """
     geometry = geometry.detach()
     echoes = echoes_of(spectra, _transmitter(spectra, tx).position)
@@ -103,10 +103,37 @@ def corrected(geometry: Gaussians, spectra: Spectrum, tx: Pose | None = None, *,
     trusted = witnesses * REGION**2 > TRUSTED * surfaces.patches.areas
     trusted &= witnesses >= LEAST_WITNESSES
     moved = flattened(geometry, surfaces, planes, trusted)
+    walls, extents = _onto_known(walls, extents, _chosen(planes, surfaces.planes, trusted), surfaces.patches.areas)
     loose = ~torch.cat((trusted, trusted.new_zeros(1)))[surfaces.plane_of]  # -1, off the planes, is the last one
     haze = loose & (in_free_space(moved.means, echoes) | behind(moved.means, walls, extents, echoes))
     kept = Gaussians(**{name: part[~haze] for name, part in moved.tensors().items()})
     return completed_by(kept, _with_planes(walls, extents, spots))
+
+
+def _chosen(first: Planes, other: Planes, chosen: Tensor) -> Planes:
+    """The `first` planes where `chosen` `[plane]`, the `other` ones elsewhere."""
+    normals = torch.where(chosen[:, None], first.normals, other.normals)
+    return Planes(normals, torch.where(chosen, first.offsets, other.offsets))
+
+
+def _onto_known(walls: Planes, extents: Patches, planes: Planes, areas: Tensor) -> tuple[Planes, Patches]:
+    """Walls that echoes tell of, those that lie on one of the `planes` of the geometry moved into it with their cells.
+
+    A few echoes near each other say that there is a wall, and not well how it is turned. `areas` `[plane]` [m^2]: of
+    several planes a wall lies on the largest.
+    """
+    normals, offsets = walls.normals.clone(), walls.offsets.clone()
+    for wall in range(len(walls)):
+        cells = surface_points(walls, extents, wall)
+        if not len(cells):
+            continue
+        height = (cells @ planes.normals.mT - planes.offsets).abs().median(0).values
+        alike = ((planes.normals @ walls.normals[wall]).abs() > PIECE_ANGLE) & (height < PIECE_DISTANCE)
+        if bool(alike.any()):
+            known = int(torch.where(alike, areas, -1.0).argmax())
+            normals[wall], offsets[wall] = planes.normals[known], planes.offsets[known]
+    known = Planes(normals, offsets)
+    return known, _moved(extents, walls, known)
 
 
 def completed_by(geometry: Gaussians, other: Gaussians) -> Gaussians:
@@ -138,8 +165,10 @@ def _with_planes(planes: Planes, patches: Patches, spots: Spots) -> Gaussians:
 
 
 def _moved(patches: Patches, before: Planes, after: Planes) -> Patches:
-    """The patches of planes that were moved: each cell goes along the normal."""
+    """The patches of planes that were moved: each cell goes along the new normal."""
     cells, plane = cells_of(before, patches)
+    height = (cells * after.normals[plane]).sum(-1) - after.offsets[plane]
+    cells = cells - height[:, None] * after.normals[plane]
     return Patches.of(after, [cells[plane == number] for number in range(len(after))], patches.cell)
 
 

@@ -16,7 +16,7 @@ from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
-from rf3dgs.training.consolidation import consolidated, oblique_planes, squared, with_skins
+from rf3dgs.training.consolidation import consolidated, oblique_planes, outlined, squared, with_skins
 from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
 from rf3dgs.training.marks import Paint, fit_marks
 from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_reflection, glints, silent_planes, silent_sources
@@ -96,6 +96,8 @@ def fit_sources(
             sources, surfaces, obstacles = _over(sources, with_mirrors(sources, mirrors), surfaces, obstacles)
             sources = with_images(sources, probes, replace(config, order=1))
             sources = _refined(sources, seen, peaks, positions, obstacles, config)
+    assert sources.patches is not None
+    sources = replace(sources, patches=outlined(sources.planes, sources.patches, obstacles))
     sources = _gated(sources, spectra, seen, obstacles)
     obstacles = cleared_by(sources, spectra, seen, obstacles)
     rays = sources.rays_each(positions, obstacles, in_sight=seen)
