@@ -61,13 +61,17 @@ def consolidated(surfaces: Surfaces, means: Tensor) -> Surfaces:
 
 
 def outlined(planes: Planes, patches: Patches, obstacles: Obstacles) -> Patches:
-    """The patches without cells at the outlines of planes through whose middle Gaussians let pass more than `SOLID`.
+    """The patches without cells at the outlines of small planes through whose middle Gaussians let pass over `SOLID`.
 
     Cells are found by what a Gaussian may cover, so that surface has no gaps; outlines then lie up to two cells
-    outside. Surface far from where Gaussians stand, as that of mirrors which photographs did not show, stays.
+    outside. That matters where a way passes beside a thing; large planes end at others. Surface far from where
+    Gaussians stand, as that of mirrors which photographs did not show, stays.
     """
-    points = []
+    points, areas = [], patches.areas
     for plane in range(len(planes)):
+        if float(areas[plane]) >= LARGE:
+            points.append(surface_points(planes, patches, plane))
+            continue
         middles, through = surface_points(planes, patches, plane), THROUGH * planes.normals[plane]
         kept = patches.grid(plane)
         solid = torch.zeros_like(kept)
