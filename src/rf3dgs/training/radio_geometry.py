@@ -127,11 +127,11 @@ def _onto_known(walls: Planes, extents: Patches, planes: Planes, areas: Tensor) 
         cells = surface_points(walls, extents, wall)
         if not len(cells):
             continue
-        height = (cells @ planes.normals.mT - planes.offsets).abs().median(0).values
-        alike = ((planes.normals @ walls.normals[wall]).abs() > PIECE_ANGLE) & (height < PIECE_DISTANCE)
-        if bool(alike.any()):
-            known = int(torch.where(alike, areas, -1.0).argmax())
-            normals[wall], offsets[wall] = planes.normals[known], planes.offsets[known]
+        alike = torch.nonzero((planes.normals @ walls.normals[wall]).abs() > PIECE_ANGLE).squeeze(-1)
+        for plane in alike[areas[alike].argsort(descending=True, stable=True)].tolist():
+            if float((cells @ planes.normals[plane] - planes.offsets[plane]).abs().median()) < PIECE_DISTANCE:
+                normals[wall], offsets[wall] = planes.normals[plane], planes.offsets[plane]
+                break
     known = Planes(normals, offsets)
     return known, _moved(extents, walls, known)
 
