@@ -346,7 +346,7 @@ def test_an_outline_is_that_of_the_thing(spacing):
     corners = torch.tensor([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 0.0, 1.9], [0.0, 0.0, 1.9]])
     gaussians = sample_mesh(corners, torch.tensor([[0, 1, 2], [0, 2, 3]]), spacing=spacing)
     surfaces = find_surfaces(gaussians, torch.tensor([[1.0, 3.0, 1.0]]))
-    unseen = torch.cartesian_prod(torch.arange(5.05, 6.0, 0.1), torch.zeros(1), torch.arange(0.05, 1.0, 0.1))
+    unseen = torch.cartesian_prod(torch.arange(5.05, 5.3, 0.1), torch.zeros(1), torch.arange(0.05, 1.0, 0.1))
     points = torch.cat((surface_points(surfaces.planes, surfaces.patches, 0), unseen))
     patches = Patches.of(surfaces.planes, [points])
     obstacles = Obstacles(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
@@ -357,7 +357,7 @@ def test_an_outline_is_that_of_the_thing(spacing):
     assert float(own[:, 0].max()) < 2.03
     assert float(own[:, 2].max()) < 1.93
     assert 0.01 * len(own) == pytest.approx(3.8, abs=0.25)
-    assert 0.01 * (len(found) - len(own)) == pytest.approx(1.0, abs=0.12)
+    assert 0.01 * (len(found) - len(own)) == pytest.approx(0.3, abs=0.11)
 
 
 def test_where_a_plane_has_surface_a_mirror_adds_none():
