@@ -9,13 +9,9 @@ from rf3dgs.core.threads import on_threads, one_torch_thread, thread_count
 
 
 @pytest.fixture
-def three_threads(monkeypatch: pytest.MonkeyPatch):
-    before = torch.get_num_threads()
+def three_threads(monkeypatch: pytest.MonkeyPatch, torch_threads):
     monkeypatch.delenv("RF3DGS_THREADS", raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
-    torch.set_num_threads(3)
-    yield
-    torch.set_num_threads(before)
 
 
 def test_torch_is_kept_to_one_thread_and_the_core_is_not(three_threads):
@@ -26,7 +22,7 @@ def test_torch_is_kept_to_one_thread_and_the_core_is_not(three_threads):
 
 def test_an_error_gives_the_threads_back(three_threads):
     with pytest.raises(ZeroDivisionError), one_torch_thread():
-        1 / 0  # noqa: B018
+        raise ZeroDivisionError
     assert (torch.get_num_threads(), thread_count()) == (3, 3)
 
 

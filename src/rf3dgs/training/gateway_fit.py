@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.errors import InputError
+from rf3dgs.core.threads import one_torch_thread
 from rf3dgs.core.units import wavelength
 from rf3dgs.data.formats.gateway import GatewaySpectra
 from rf3dgs.field.gateway import GAIN_LENGTH, GatewayField, Waves, kernel
@@ -71,6 +72,7 @@ class GatewayFit:
     misfit: float
 
 
+@one_torch_thread()
 def fit_gateway(spectra: GatewaySpectra, config: GatewayConfig | None = None) -> GatewayFit:
     """A field over the transmitter's places out of measured pictures; InputError for fewer than eight of them."""
     config = config or GatewayConfig()

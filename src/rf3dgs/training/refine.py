@@ -5,6 +5,7 @@ from dataclasses import replace
 import torch
 
 from rf3dgs.core.errors import InputError
+from rf3dgs.core.threads import one_torch_thread
 from rf3dgs.field.lit import LitSurface
 from rf3dgs.field.radio_field import RadioField
 from rf3dgs.spectra.spectrum import Spectrum
@@ -16,6 +17,7 @@ from rf3dgs.training.residual import refine_residual
 SAME_PLACE = 0.05  # m
 
 
+@one_torch_thread()
 def refine_field(field: RadioField, spectra: Spectrum) -> RadioField:
     """The field with its residual corrected by what `spectra` `[position, row, col]` show beside it.
 
