@@ -5,6 +5,7 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 
+#include <limits>
 #include <optional>
 #include <stdexcept>
 
@@ -29,12 +30,15 @@ auto* data_or_null(const std::optional<Array>& array) {
 }
 
 // A pinhole camera, or without a camera matrix the whole sphere.
-inline View view_of(const In<4, 4>& viewmat, const std::optional<In<3, 3>>& camera, int width, int height) {
+inline View view_of(const In<4, 4>& viewmat, const std::optional<In<3, 3>>& camera, int width, int height,
+                    float blur) {
   require(width > 0 && height > 0, "a picture needs at least one pixel each way");
+  require(blur > 0.0f && blur < std::numeric_limits<float>::infinity(), "the blur is a positive number of pixels^2");
   View view{};
   view.kind = camera ? Kind::pinhole : Kind::sphere;
   view.width = width;
   view.height = height;
+  view.blur = blur;
   const float* m = viewmat.data();
   for (int row = 0; row < 3; ++row) {
     for (int col = 0; col < 3; ++col) view.rotation[3 * row + col] = m[4 * row + col];

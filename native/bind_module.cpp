@@ -34,8 +34,9 @@ Geometry geometry_of(const In<-1, 3>& means, const In<-1, 4>& quats, const In<-1
 
 std::unique_ptr<Scene> forward(In<-1, 3> means, In<-1, 4> quats, In<-1, 3> scales, In<-1> opacities, In<-1, -1> values,
                                In<4, 4> viewmat, std::optional<In<3, 3>> camera, std::optional<In<-1>> background,
-                               std::optional<In<-1, 2>> offset, std::optional<float> gate, Out<-1, -1, -1> picture,
-                               Out<-1, -1> weight, Out<-1> radii, std::optional<Out<-1>> max_weight, int threads) {
+                               std::optional<In<-1, 2>> offset, float blur, std::optional<float> gate,
+                               Out<-1, -1, -1> picture, Out<-1, -1> weight, Out<-1> radii,
+                               std::optional<Out<-1>> max_weight, int threads) {
   const Geometry geometry = geometry_of(means, quats, scales, opacities, offset);
   const size_t count = means.shape(0), channels = values.shape(1);
   const size_t height = picture.shape(0), width = picture.shape(1);
@@ -45,7 +46,7 @@ std::unique_ptr<Scene> forward(In<-1, 3> means, In<-1, 4> quats, In<-1, 3> scale
               (!max_weight || max_weight->shape(0) == count),
           "outputs do not fit the inputs");
   require(!gate || *gate >= 0.0f, "the gate is a distance");
-  const View view = view_of(viewmat, camera, static_cast<int>(width), static_cast<int>(height));
+  const View view = view_of(viewmat, camera, static_cast<int>(width), static_cast<int>(height), blur);
   const float* const all_values = values.data();
   const auto values_of = [=](size_t begin, size_t end, const uint32_t* sources, float* to) {
     for (size_t at = 0; at < end - begin; ++at) {
@@ -186,7 +187,7 @@ NB_MODULE(_native, m) {
   m.def("rasterize", &forward, nb::arg("means").noconvert(), nb::arg("quats").noconvert(),
         nb::arg("scales").noconvert(), nb::arg("opacities").noconvert(), nb::arg("values").noconvert(),
         nb::arg("viewmat").noconvert(), nb::arg("camera").noconvert().none(), nb::arg("background").noconvert().none(),
-        nb::arg("offset").noconvert().none(), nb::arg("gate").none(), nb::arg("picture").noconvert(),
+        nb::arg("offset").noconvert().none(), nb::arg("blur"), nb::arg("gate").none(), nb::arg("picture").noconvert(),
         nb::arg("weight").noconvert(), nb::arg("radii").noconvert(), nb::arg("max_weight").noconvert().none(),
         nb::arg("threads"));
   m.def("rasterize_backward", &backward, nb::arg("scene"), nb::arg("means").noconvert(), nb::arg("quats").noconvert(),

@@ -51,12 +51,12 @@ struct Wishes {
 
 std::shared_ptr<Wishes> wishes_of(const In<4, 4>& viewmat, const std::optional<In<3, 3>>& camera, int width, int height,
                                   size_t count, int channels, std::optional<In<-1, -1>> extra, bool depth,
-                                  std::optional<In<-1>> background, std::optional<float> gate, bool normalise,
-                                  const std::vector<bool>& in_window, double floor_db, double ceil_db,
+                                  std::optional<In<-1>> background, float blur, std::optional<float> gate,
+                                  bool normalise, const std::vector<bool>& in_window, double floor_db, double ceil_db,
                                   std::optional<In<-1, -1, -1>> added) {
   auto wishes = std::make_shared<Wishes>(Wishes{std::move(extra), std::move(background), std::move(added), {}, {}});
   Drawing& drawing = wishes->drawing;
-  drawing.view = view_of(viewmat, camera, width, height);
+  drawing.view = view_of(viewmat, camera, width, height, blur);
   drawing.extra = data_or_null(wishes->extra);
   drawing.extras = wishes->extra ? static_cast<int>(wishes->extra->shape(1)) : 0;
   drawing.depth = depth;
@@ -136,12 +136,12 @@ class BoundTrainer {
   }
 
   void draw(In<4, 4> viewmat, std::optional<In<3, 3>> camera, int width, int height, int bases,
-            std::optional<In<-1, -1>> extra, bool depth, std::optional<In<-1>> background, std::optional<float> gate,
-            bool normalise, std::vector<bool> in_window, double floor_db, double ceil_db,
+            std::optional<In<-1, -1>> extra, bool depth, std::optional<In<-1>> background, float blur,
+            std::optional<float> gate, bool normalise, std::vector<bool> in_window, double floor_db, double ceil_db,
             std::optional<In<-1, -1, -1>> added, Out<-1, -1, -1> picture, Out<-1, -1> weight, Out<-1> radii,
             int threads) {
     look(bases, wishes_of(viewmat, camera, width, height, population_.count, population_.channels, extra, depth,
-                          background, gate, normalise, in_window, floor_db, ceil_db, added));
+                          background, blur, gate, normalise, in_window, floor_db, ceil_db, added));
     require(fits(picture) && weight.size() * wishes_->drawing.finishing.channels == picture.size() &&
                 radii.size() == population_.count,
             "outputs do not fit the drawing");
@@ -162,13 +162,13 @@ class BoundTrainer {
   }
 
   double step(In<4, 4> viewmat, std::optional<In<3, 3>> camera, int width, int height, int bases,
-              std::optional<In<-1, -1>> extra, bool depth, std::optional<In<-1>> background, std::optional<float> gate,
-              bool normalise, std::vector<bool> in_window, double floor_db, double ceil_db,
+              std::optional<In<-1, -1>> extra, bool depth, std::optional<In<-1>> background, float blur,
+              std::optional<float> gate, bool normalise, std::vector<bool> in_window, double floor_db, double ceil_db,
               std::optional<In<-1, -1, -1>> added, In<-1, -1, -1> target, std::optional<In<-1, -1>> weight,
               std::optional<In<2, -1, -1>> statistics, float ssim_weight, float means, float quats, float log_scales,
               float opacity, In<-1, -1> sh, float shrink, int64_t steps, int threads) {
     look(bases, wishes_of(viewmat, camera, width, height, population_.count, population_.channels, extra, depth,
-                          background, gate, normalise, in_window, floor_db, ceil_db, added));
+                          background, blur, gate, normalise, in_window, floor_db, ceil_db, added));
     const LossTarget compared = target_of(target, weight, statistics);
     require(fits(target), "the target does not have the size and channels of what is drawn");
     const Rates rates = rates_of(means, quats, log_scales, opacity, sh, shrink, steps);
@@ -214,7 +214,7 @@ void order_of(In<-1, 3> means, nb::ndarray<int32_t, nb::shape<-1>, nb::c_contig,
 
 void draw_plain(In<-1, 3> means, In<-1, 4> quats, In<-1, 3> log_scales, In<-1> logits, In<-1, -1, -1> sh, float offset,
                 bool clamp, In<4, 4> viewmat, std::optional<In<3, 3>> camera, int width, int height, int bases,
-                std::optional<In<-1, -1>> extra, bool depth, std::optional<In<-1>> background,
+                std::optional<In<-1, -1>> extra, bool depth, std::optional<In<-1>> background, float blur,
                 std::optional<float> gate, bool normalise, std::vector<bool> in_window, double floor_db, double ceil_db,
                 std::optional<In<-1, -1, -1>> added, Out<-1, -1, -1> picture, Out<-1, -1> weight, Out<-1> radii,
                 int threads) {
@@ -224,7 +224,7 @@ void draw_plain(In<-1, 3> means, In<-1, 4> quats, In<-1, 3> log_scales, In<-1> l
               radii.shape(0) == count && channels > 0 && sh.shape(1) == static_cast<size_t>(bases) &&
               (bases == 1 || bases == 4 || bases == 9 || bases == 16),
           "all arrays need one row per Gaussian, harmonics 1, 4, 9 or 16 coefficients");
-  const auto wishes = wishes_of(viewmat, camera, width, height, count, channels, extra, depth, background, gate,
+  const auto wishes = wishes_of(viewmat, camera, width, height, count, channels, extra, depth, background, blur, gate,
                                 normalise, in_window, floor_db, ceil_db, added);
   require(picture.shape(0) == static_cast<size_t>(height) && picture.shape(1) == static_cast<size_t>(width) &&
               picture.shape(2) == static_cast<size_t>(wishes->drawing.finishing.channels) &&

@@ -34,6 +34,7 @@ struct View {
   int width, height;
   float fx, fy, cx, cy;
   float u_low, u_high, v_low, v_high;
+  float blur = kBlur;  // added to both variances of a projected Gaussian [pixel^2]
   SphereGrid sphere;
 };
 

@@ -72,7 +72,7 @@ struct Sides {
   Side side[5];
 
   RF_INLINE explicit Sides(const View& view) {
-    const float reach = 1.01f * __builtin_sqrtf(kReach2), blur = __builtin_sqrtf(kReach2 * kBlur) + 1.0f;
+    const float reach = 1.01f * __builtin_sqrtf(kReach2), blur = __builtin_sqrtf(kReach2 * view.blur) + 1.0f;
     const float u = __builtin_fmaxf(__builtin_fabsf(view.u_low), __builtin_fabsf(view.u_high));
     const float v = __builtin_fmaxf(__builtin_fabsf(view.v_low), __builtin_fabsf(view.v_high));
     const float wide = reach * __builtin_fabsf(view.fx) * __builtin_sqrtf(1.0f + u * u);

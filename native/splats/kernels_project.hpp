@@ -109,8 +109,8 @@ RF_INLINE void project_centres(const View& view, const Geometry& in, const Which
 // fy sqrt(1 + v^2) / z, and no Gaussian is longer than its largest scale.
 RF_INLINE bool may_be_seen(const View& view, const Vec& opacity, const Projection& p) {
   const Vec scale = max_vec(p.s[0], max_vec(p.s[1], p.s[2])) * p.inverse_z, scale2 = scale * scale * (1.01f * kReach2);
-  const Vec wide = sqrt_vec(scale2 * (view.fx * view.fx) * (1.0f + p.u * p.u) + kReach2 * kBlur) + 1.0f;
-  const Vec tall = sqrt_vec(scale2 * (view.fy * view.fy) * (1.0f + p.v * p.v) + kReach2 * kBlur) + 1.0f;
+  const Vec wide = sqrt_vec(scale2 * (view.fx * view.fx) * (1.0f + p.u * p.u) + kReach2 * view.blur) + 1.0f;
+  const Vec tall = sqrt_vec(scale2 * (view.fy * view.fy) * (1.0f + p.v * p.v) + kReach2 * view.blur) + 1.0f;
   const Vec width = splat_vec(static_cast<float>(view.width)), height = splat_vec(static_cast<float>(view.height));
   const IntVec beside = (p.screen_x + wide < 0.0f) | (p.screen_x - wide > width) | (p.screen_y + tall < 0.0f) |
                         (p.screen_y - tall > height);
@@ -137,9 +137,9 @@ RF_INLINE void project_shapes(const View& view, const Geometry& in, const Which&
   const Vec first = a[0] * a[0] + a[1] * a[1] + a[2] * a[2];
   const Vec second = a[3] * a[3] + a[4] * a[4] + a[5] * a[5];
   const Vec c0 = a[1] * a[5] - a[2] * a[4], c1 = a[2] * a[3] - a[0] * a[5], c2 = a[0] * a[4] - a[1] * a[3];
-  const Vec determinant = kBlur * kBlur + kBlur * (first + second) + (c0 * c0 + c1 * c1 + c2 * c2);
-  p.sxx = first + kBlur;
-  p.syy = second + kBlur;
+  const Vec determinant = view.blur * view.blur + view.blur * (first + second) + (c0 * c0 + c1 * c1 + c2 * c2);
+  p.sxx = first + view.blur;
+  p.syy = second + view.blur;
   p.sxy = a[0] * a[3] + a[1] * a[4] + a[2] * a[5];
   p.fine &= is_finite(determinant);
   p.inverse_determinant = 1.0f / determinant;

@@ -84,7 +84,7 @@ RF_INLINE void project_sphere_lanes(const View& view, const Geometry& in, const 
       p.a[3 * row + col] = (t[0] * p.r[col] + t[1] * p.r[3 + col] + t[2] * p.r[6 + col]) * p.s[col];
     }
   }
-  const float blur = kBlur * pixel_area(view);
+  const float blur = view.blur * pixel_area(view);
   const Vec* a = p.a;
   const Vec first = a[0] * a[0] + a[1] * a[1] + a[2] * a[2];
   const Vec second = a[3] * a[3] + a[4] * a[4] + a[5] * a[5];

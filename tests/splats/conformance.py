@@ -46,6 +46,8 @@ VIEWS: dict[str, View] = {
 OPTIONS = {
     "background": Case(background=True),
     "gate": Case(compositing=Compositing(depth_gate=0.3), background=True),
+    "little blur": Case(compositing=Compositing(blur=0.02), background=True),
+    "much blur": Case(compositing=Compositing(blur=4.0), background=True),
     "normalise": Case(compositing=Compositing(normalise=True)),
     "added": Case(added=True),
     "db_window": Case(compositing=Compositing(transfer="db_window", **WINDOW)),

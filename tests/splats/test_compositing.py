@@ -83,6 +83,8 @@ def test_behind_the_gate_a_lamp_leaves_no_ghost(view: View):
 def test_bad_options_are_named():
     with pytest.raises(InputError, match="depth_gate must be a length of 0 m or more, or None; got -1"):
         Compositing(depth_gate=-1.0)
+    with pytest.raises(InputError, match=r"blur must be a positive number of square pixels; got 0\.0"):
+        Compositing(blur=0.0)
     with pytest.raises(InputError, match='transfer must be "identity" or "db_window"'):
         Compositing(transfer="log")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="db_window needs floor_db < ceil_db in dB; got None and None"):

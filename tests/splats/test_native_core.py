@@ -9,7 +9,7 @@ from torch import Tensor
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, pinhole_grid
 from rf3dgs.core.native import native_core
-from rf3dgs.splats.constants import ALPHA_MAX, ALPHA_MIN, GATE_TRANSMITTANCE, TRANSMITTANCE_STOP
+from rf3dgs.splats.constants import ALPHA_MAX, ALPHA_MIN, BLUR, GATE_TRANSMITTANCE, TRANSMITTANCE_STOP
 from rf3dgs.splats.projection import project
 
 POSE = Pose.look_at(position=(-3.0, 0.5, 0.3), target=(0.0, 0.0, 0.0))
@@ -48,7 +48,7 @@ class Drawing:
         self.radii = torch.full((len(tensors[0]),), torch.nan)
         matrices = (camera.viewmat.float().contiguous(), camera.K.float().contiguous())
         outputs = (self.picture, self.weight, self.radii, max_weight)
-        self.scene = self.core.rasterize(*tensors, *matrices, None, None, gate, *outputs, threads)
+        self.scene = self.core.rasterize(*tensors, *matrices, None, None, BLUR, gate, *outputs, threads)
 
     def gradients(self, of_picture: Tensor, of_weight: Tensor) -> list[Tensor]:
         means, quats, scales, opacities, values = self.tensors

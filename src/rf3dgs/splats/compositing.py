@@ -1,7 +1,7 @@
-"""How blended channels become a picture: depth gate, division by the weight, an added picture, the channels' transfer.
+"""How Gaussians become a picture: blur, depth gate, division by the weight, an added picture, the channels' transfer.
 
-The functions are the specification of every backend and of the fused training step. The order is: blend (with the depth
-gate), divide by the accumulated weight, add, transfer.
+The functions are the specification of every backend and of the fused training step. The order is: blend (with the
+blur and the depth gate), divide by the accumulated weight, add, transfer.
 """
 
 import math
@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.errors import InputError
+from rf3dgs.splats.constants import BLUR
 
 Transfer = Literal["identity", "db_window"]
 
@@ -26,6 +27,8 @@ class Compositing:
     normalise: channels are divided by the accumulated weight; they are zero where the weight is.
     transfer: one for all channels or one for each: "identity", or "db_window" for linear power to be shown in the
         window from floor_db (0) to ceil_db (1), see `db_window`.
+    blur [pixel^2]: added to both variances of a projected Gaussian, so that none falls between the middles of pixels.
+        What stands before something else is seen wider by it, which is much where pixels are wide.
     """
 
     depth_gate: float | None = None
@@ -33,8 +36,11 @@ class Compositing:
     transfer: Transfer | tuple[Transfer, ...] = "identity"
     floor_db: float | None = None
     ceil_db: float | None = None
+    blur: float = BLUR
 
     def __post_init__(self) -> None:
+        if not (math.isfinite(self.blur) and self.blur > 0):
+            raise InputError(f"blur must be a positive number of square pixels; got {self.blur}")
         if self.depth_gate is not None and not (math.isfinite(self.depth_gate) and self.depth_gate >= 0):
             raise InputError(f"depth_gate must be a length of 0 m or more, or None; got {self.depth_gate}")
         names = (self.transfer,) if isinstance(self.transfer, str) else self.transfer

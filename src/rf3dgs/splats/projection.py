@@ -16,11 +16,13 @@ from rf3dgs.core.grids import Camera, Panorama
 from rf3dgs.splats.constants import ALPHA_MIN, BLUR, FIELD_CLAMP
 
 
-def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+def project(
+    means: Tensor, quats: Tensor, scales: Tensor, camera: Camera, blur: float = BLUR
+) -> tuple[Tensor, Tensor, Tensor]:
     """Centres `[gaussian, 2]` [pixel], covariances `[gaussian, 2, 2]` [pixel^2] and view depths `[gaussian]` [m].
 
-    The covariance is J W Sigma W^T J^T plus the blur, where J is the Jacobian of the pinhole projection at a point
-    whose x/z and y/z are kept within 1.3 times the field, each side measured from the principal point.
+    The covariance is J W Sigma W^T J^T plus the `blur` [pixel^2], where J is the Jacobian of the pinhole projection at
+    a point whose x/z and y/z are kept within 1.3 times the field, each side measured from the principal point.
     """
     viewmat, K = camera.viewmat.to(means), camera.K.to(means)
     rotation = viewmat[:3, :3]
@@ -33,17 +35,17 @@ def project(means: Tensor, quats: Tensor, scales: Tensor, camera: Camera) -> tup
     first = torch.stack((fx / z, zero, -fx * u / z), -1)
     second = torch.stack((zero, fy / z, -fy * v / z), -1)
     spread = torch.stack((first, second), -2) @ rotation @ matrix_from_quaternion(quats) * scales[:, None, :]
-    return centre, spread @ spread.mT + BLUR * torch.eye(2, dtype=means.dtype, device=means.device), z
+    return centre, spread @ spread.mT + blur * torch.eye(2, dtype=means.dtype, device=means.device), z
 
 
 def project_sphere(
-    means: Tensor, quats: Tensor, scales: Tensor, view: Panorama
+    means: Tensor, quats: Tensor, scales: Tensor, view: Panorama, blur: float = BLUR
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Directions `[gaussian, 3]`, tangent axes `[gaussian, 2, 3]`, covariances `[gaussian, 2, 2]` [rad^2], ranges [m].
 
     Unit vectors in the camera frame. With m the direction at range r and E the two axes, any that are orthonormal and
     at right angles to m, the covariance in the tangent plane is E W Sigma W^T E^T / r^2 plus the blur, which is as many
-    square radians as BLUR square pixels have at the equator, the same in all directions.
+    square radians as `blur` square pixels have at the equator, the same in all directions.
     """
     viewmat = view.viewmat.to(means)
     rotation = viewmat[:3, :3]
@@ -52,8 +54,8 @@ def project_sphere(
     direction = seen / distance[:, None]
     axes = tangent_axes(direction)
     spread = axes @ rotation @ matrix_from_quaternion(quats) * (scales / distance[:, None])[:, None, :]
-    blur = BLUR * pixel_area(view) * torch.eye(2, dtype=means.dtype, device=means.device)
-    return direction, axes, spread @ spread.mT + blur, distance
+    widened = spread @ spread.mT + blur * pixel_area(view) * torch.eye(2, dtype=means.dtype, device=means.device)
+    return direction, axes, widened, distance
 
 
 def tangent_axes(direction: Tensor) -> Tensor:

@@ -76,7 +76,12 @@ def rasterize(
         name, reason = pick_backend(means.device.type, means.dtype)
     _log_once(name, reason)
     arguments = (means, quats, scales, opacities, values, view)
-    options = {"background": background, "screen_offset": screen_offset, "depth_gate": compositing.depth_gate}
+    options = {
+        "background": background,
+        "screen_offset": screen_offset,
+        "blur": compositing.blur,
+        "depth_gate": compositing.depth_gate,
+    }
     if name == "native":
         if means.dtype != torch.float32 or means.device.type != "cpu":
             raise InputError(

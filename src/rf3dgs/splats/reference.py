@@ -14,6 +14,7 @@ from rf3dgs.core.grids import Camera, Panorama, View
 from rf3dgs.splats.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
+    BLUR,
     GATE_TRANSMITTANCE,
     NEAR,
     SPHERE_FIELD,
@@ -42,22 +43,23 @@ def rasterize_reference(
     *,
     background: Tensor | None = None,
     screen_offset: Tensor | None = None,
+    blur: float = BLUR,
     depth_gate: float | None = None,
 ) -> Raster:
     """Blend `values` `[gaussian, channel]` front to back into the picture that `view` sees.
 
     `means` `[gaussian, 3]` [m], `quats` `[gaussian, 4]` (wxyz, any length), `scales` `[gaussian, 3]` [m] and
     `opacities` `[gaussian]` are activated values. `background` `[channel]` fills what the Gaussians let through;
-    `screen_offset` `[gaussian, 2]` [pixel] moves the projected centres of a camera's view; `depth_gate` [m] is
-    `Compositing`'s. Gaussians that are not finite, have a zero quaternion, a negative scale or an opacity below 1/255,
-    or lie before the near plane or beside the picture, are not drawn.
+    `screen_offset` `[gaussian, 2]` [pixel] moves the projected centres of a camera's view; `blur` [pixel^2] and
+    `depth_gate` [m] are `Compositing`'s. Gaussians that are not finite, have a zero quaternion, a negative scale or an
+    opacity below 1/255, or lie before the near plane or beside the picture, are not drawn.
     """
-    index, radii = _drawn(means, quats, scales, opacities, values, view, screen_offset)
+    index, radii = _drawn(means, quats, scales, opacities, values, view, screen_offset, blur)
     shape = means[index], quats[index], scales[index]
     if isinstance(view, Camera):
-        pixels, depth, power = _on_camera(*shape, view, None if screen_offset is None else screen_offset[index])
+        pixels, depth, power = _on_camera(*shape, view, None if screen_offset is None else screen_offset[index], blur)
     else:
-        pixels, depth, power = _on_sphere(*shape, view)
+        pixels, depth, power = _on_sphere(*shape, view, blur)
     picture, weight = [], []
     for pixel in pixels.split(max(1, _PAIRS_PER_CHUNK // max(1, len(index)))):
         alpha = (opacities[index, None] * torch.exp(power(pixel))).clamp_max(ALPHA_MAX)
@@ -78,10 +80,10 @@ def rasterize_reference(
 
 
 def _on_camera(
-    means: Tensor, quats: Tensor, scales: Tensor, camera: Camera, offset: Tensor | None
+    means: Tensor, quats: Tensor, scales: Tensor, camera: Camera, offset: Tensor | None, blur: float
 ) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
     """Pixels, depths, and the function of pixels that gives each Gaussian's exponent `[gaussian, pixel]`."""
-    centre, covariance, depth = project(means, quats, scales, camera)
+    centre, covariance, depth = project(means, quats, scales, camera, blur)
     centre = centre if offset is None else centre + offset
     inverse = torch.linalg.inv(covariance)
     row, col = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
@@ -95,10 +97,10 @@ def _on_camera(
 
 
 def _on_sphere(
-    means: Tensor, quats: Tensor, scales: Tensor, view: Panorama
+    means: Tensor, quats: Tensor, scales: Tensor, view: Panorama, blur: float
 ) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
     """The same on the sphere, where pixels are directions `[pixel, 3]` and meet each Gaussian's tangent plane."""
-    direction, axes, covariance, distance = project_sphere(means, quats, scales, view)
+    direction, axes, covariance, distance = project_sphere(means, quats, scales, view, blur)
     inverse = torch.linalg.inv(covariance)
 
     def power(pixel: Tensor) -> Tensor:
@@ -119,17 +121,18 @@ def _drawn(
     values: Tensor,
     view: View,
     offset: Tensor | None,
+    blur: float,
 ) -> tuple[Tensor, Tensor]:
     """Indices of the Gaussians that are drawn, front to back, and everyone's radius `[gaussian]` [pixel]."""
     with torch.no_grad():
         if isinstance(view, Camera):
-            centre, covariance, depth = project(means, quats, scales, view)
+            centre, covariance, depth = project(means, quats, scales, view, blur)
             centre = centre if offset is None else centre + offset
             reach = extent(opacities)[:, None] * covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
             inside = ((centre + reach > 0) & (centre - reach < centre.new_tensor([view.width, view.height]))).all(-1)
             pixel = 1.0
         else:
-            centre, _, covariance, depth = project_sphere(means, quats, scales, view)
+            centre, _, covariance, depth = project_sphere(means, quats, scales, view, blur)
             inside = torch.ones_like(depth, dtype=torch.bool)
             pixel = pixel_area(view) ** 0.5
         drawn = inside & (depth > NEAR) & (opacities >= ALPHA_MIN) & (scales >= 0).all(-1)

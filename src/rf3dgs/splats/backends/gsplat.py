@@ -39,6 +39,7 @@ def rasterize_gsplat(
     *,
     background: Tensor | None = None,
     screen_offset: Tensor | None = None,
+    blur: float = BLUR,
     depth_gate: float | None = None,
     module: ModuleType | None = None,
 ) -> Raster:
@@ -57,9 +58,9 @@ def rasterize_gsplat(
     gsplat = load_gsplat() if module is None else module
     gaussians = (means, quats, scales, opacities, values)
     if isinstance(view, Camera):
-        return _pinhole(gsplat, *gaussians, view, background, screen_offset)
+        return _pinhole(gsplat, *gaussians, view, background, screen_offset, blur)
     size = max(8, math.ceil(view.width / math.pi))
-    faces = [_pinhole(gsplat, *gaussians, camera, background, None) for camera in face_cameras(view.pose, size)]
+    faces = [_pinhole(gsplat, *gaussians, camera, background, None, blur) for camera in face_cameras(view.pose, size)]
     pictures = torch.stack([torch.cat((face.values, face.weight[..., None]), -1) for face in faces])
     sampled = sample_faces(pictures, size, view.grid.directions.to(means))
     radii = torch.stack([face.radii for face in faces]).amax(0)
@@ -76,6 +77,7 @@ def _pinhole(
     camera: Camera,
     background: Tensor | None,
     screen_offset: Tensor | None,
+    blur: float,
 ) -> Raster:
     device = means.device
     viewmat, K = camera.viewmat.to(device), camera.K.to(device)
@@ -92,7 +94,7 @@ def _pinhole(
         sh_degree=None,
         packed=False,
         near_plane=NEAR,
-        eps2d=BLUR,
+        eps2d=blur,
         backgrounds=None if background is None else background[None],
     )
     radii = info["radii"][0]

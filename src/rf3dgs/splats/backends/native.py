@@ -15,6 +15,7 @@ from rf3dgs.core.errors import MissingDependencyError
 from rf3dgs.core.grids import Camera, Panorama, View
 from rf3dgs.core.native import native_core, native_failure
 from rf3dgs.core.threads import thread_count
+from rf3dgs.splats.constants import BLUR
 from rf3dgs.splats.projection import project_sphere
 from rf3dgs.splats.raster import Raster
 
@@ -54,6 +55,7 @@ class _Rasterize(torch.autograd.Function):
         background: Tensor | None,
         offset: Tensor | None,
         view: View,
+        blur: float,
         gate: float | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         inputs = [None if tensor is None else _plain(tensor) for tensor in (means, quats, scales, opacities, values)]
@@ -62,10 +64,11 @@ class _Rasterize(torch.autograd.Function):
         picture = torch.empty(view.height, view.width, values.shape[1])
         weight = torch.empty(view.height, view.width)
         radii = torch.empty(len(means))
+        outputs = picture, weight, radii
         viewmat = _plain(view.viewmat).float()
         K = _plain(view.K).float() if isinstance(view, Camera) else None
-        scene = core().rasterize(*inputs, viewmat, K, fill, shift, gate, picture, weight, radii, None, thread_count())
-        ctx.scene, ctx.view = scene, view
+        scene = core().rasterize(*inputs, viewmat, K, fill, shift, blur, gate, *outputs, None, thread_count())
+        ctx.scene, ctx.view, ctx.blur = scene, view, blur
         ctx.save_for_backward(*inputs, shift, picture, weight)
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
@@ -77,7 +80,7 @@ class _Rasterize(torch.autograd.Function):
         of_picture, of_weight, _ = gradients
         *inputs, shift, picture, weight = ctx.saved_tensors
         if of_picture is None and of_weight is None:
-            return (None,) * 9
+            return (None,) * 10
         of_picture = torch.zeros_like(picture) if of_picture is None else _plain(of_picture)
         of_weight = None if of_weight is None else _plain(of_weight)
         needs = ctx.needs_input_grad
@@ -96,16 +99,16 @@ class _Rasterize(torch.autograd.Function):
             ctx.scene, *inputs[:4], shift, picture, weight, of_picture, of_weight, *outputs, thread_count()
         )
         if to_sphere is not None and isinstance(view, Panorama):
-            to_means, to_quats, to_scales = _through_sphere(means, quats, scales, view, to_sphere)
+            to_means, to_quats, to_scales = _through_sphere(means, quats, scales, view, ctx.blur, to_sphere)
         to_background = None
         if needs[5]:
             to_background = torch.einsum("hwc,hw->c", of_picture, 1 - weight)
         result = (to_means, to_quats, to_scales, to_opacities, to_values, to_background, to_offset)
-        return (*(gradient if need else None for gradient, need in zip(result, needs, strict=False)), None, None)
+        return (*(gradient if need else None for gradient, need in zip(result, needs, strict=False)), None, None, None)
 
 
 def _through_sphere(
-    means: Tensor, quats: Tensor, scales: Tensor, view: Panorama, gradients: Tensor
+    means: Tensor, quats: Tensor, scales: Tensor, view: Panorama, blur: float, gradients: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gradients of means, quats and scales from those `[gaussian, 9]` of what the sphere's splats are drawn with.
 
@@ -117,7 +120,7 @@ def _through_sphere(
         tensor[index].double().requires_grad_() for tensor in (means, quats, scales)
     ]
     with torch.enable_grad():
-        direction, axes, covariance, _ = project_sphere(means_of, quats_of, scales_of, view)
+        direction, axes, covariance, _ = project_sphere(means_of, quats_of, scales_of, view, blur)
         shape = axes.mT @ torch.linalg.inv(covariance) @ axes
         upper = gradients[index][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].double().reshape(-1, 3, 3)
         loss = (upper * shape).sum() + (gradients[index][:, 6:].double() * direction).sum()
@@ -139,10 +142,11 @@ def rasterize_native(
     *,
     background: Tensor | None = None,
     screen_offset: Tensor | None = None,
+    blur: float = BLUR,
     depth_gate: float | None = None,
 ) -> Raster:
     """Blended channels of `rasterize` by the native core; see there."""
-    arguments = (means, quats, scales, opacities, values, background, screen_offset, view, depth_gate)
+    arguments = (means, quats, scales, opacities, values, background, screen_offset, view, blur, depth_gate)
     return Raster(*_Rasterize.apply(*arguments))  # type: ignore[misc]
 
 
@@ -157,7 +161,7 @@ def raise_to_weights_native(largest: Tensor, shape: tuple[Tensor, Tensor, Tensor
     size = view.height, view.width
     outputs = torch.empty(*size, 1), torch.empty(size), torch.empty_like(largest), largest
     values = torch.zeros(len(largest), 1)
-    core().rasterize(*inputs, values, viewmat, K, None, None, None, *outputs, thread_count())
+    core().rasterize(*inputs, values, viewmat, K, None, None, BLUR, None, *outputs, thread_count())
 
 
 class _Harmonics(torch.autograd.Function):

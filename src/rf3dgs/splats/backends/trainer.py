@@ -158,9 +158,9 @@ def view_arguments(view: View) -> tuple[Tensor, Tensor | None, int, int]:
 
 
 def _finishing(look: Look) -> tuple[Any, ...]:
-    """Depth gate, division by the weight, the channels in a window, its ends, and the added picture."""
+    """Blur, depth gate, division by the weight, the channels in a window, its ends, and the added picture."""
     how = look.compositing
     names = how.transfers(1) if isinstance(how.transfer, str) else how.transfer
     in_window = [name == "db_window" for name in names]
     window = how.window if any(in_window) else (0.0, 1.0)
-    return how.depth_gate, how.normalise, in_window, *window, look.added
+    return how.blur, how.depth_gate, how.normalise, in_window, *window, look.added
