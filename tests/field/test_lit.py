@@ -190,6 +190,48 @@ def test_a_lit_floor_sends_the_analytic_integral():
     assert float(error_db.square().mean().sqrt()) < 0.5
 
 
+def board(x: float, wide: float, spacing: float) -> Gaussians:
+    """A board of 4 m height that stands across the x axis."""
+    half = wide / 2
+    corner = torch.tensor([[x, -half, 0.0], [x, half, 0.0], [x, half, 4.0], [x, -half, 4.0]])
+    return sample_mesh(corner, torch.tensor([[0, 1, 2], [0, 2, 3]]), spacing=spacing, thickness=0.005)
+
+
+@pytest.mark.parametrize("distance", [6.0, 10.0])
+def test_a_dark_board_hides_of_a_bright_wall_what_its_outline_does(distance):
+    """On a grid whose pixels are as wide as the board: the mean over ways to lay pixels over it is its own width."""
+    parts = [board(distance, 0.4, 0.04), board(14.0, 12.0, 0.1)]
+    of_parts = torch.repeat_interleave(torch.arange(2), torch.tensor([len(part) for part in parts]))
+    count = len(of_parts)
+    surface = facet(
+        means=torch.cat([part.means for part in parts]),
+        quats=torch.cat([part.quats for part in parts]),
+        log_scales=torch.cat([part.log_scales for part in parts]),
+        logit_opacities=torch.cat([part.logit_opacities for part in parts]),
+        normals=torch.tensor([-1.0, 0.0, 0.0]).expand(count, 3).contiguous(),
+        visibility=torch.zeros(count),
+        segment_of=of_parts,
+        cell_of=of_parts,
+        laws=torch.tensor([[-300.0, 0.0, 0.0, -100.0, 0.0], [-300.0, 0.0, 0.0, -60.0, 0.0]]),
+        segment_sh=torch.zeros(2, 16),
+        cell_sh=torch.zeros(2, 16),
+        level=torch.zeros(count),
+        ambient=torch.zeros(count, 4),
+        segment_csi=torch.zeros(2, 9, 4),
+        cell_csi=torch.zeros(2, 9, 4),
+        own_csi=torch.zeros(count, 4),
+    )
+    pixel = 2.0  # degrees
+    hidden = []
+    for turned in torch.arange(0.0, pixel, pixel / 10).tolist():
+        facing = (math.cos(math.radians(turned)), math.sin(math.radians(turned)), 2.0)
+        view = view_of(Pose.look_at((0.0, 0.0, 2.0), facing), equirect_grid(180, 90))
+        shown = surface.picture(view, csi=False)[44:46, 80:100, 0] * surface.unit
+        hidden.append(pixel * float((1 - (shown / 1e-6).clamp(0, 1).mean(0)).sum()))
+    wide = 2 * math.degrees(math.atan(0.2 / distance))
+    assert sum(hidden) / len(hidden) == pytest.approx(wide, abs=0.5 * pixel)
+
+
 def test_delay_of_a_lit_wall_is_that_of_the_single_bounce():
     laws = LAWS.clone()
     laws[0, 3] = -300.0

@@ -55,7 +55,7 @@ OF_EACH = (
 LARGEST_RESIDUAL_DB = 12.0
 AMBIENT_DISTANCE = 5.0  # [m], where the ambient level is stated
 LEAST_COSINE = 0.01
-BLENDING = Compositing(depth_gate=0.3, normalise=True, blur=0.02)
+BLENDING = Compositing(depth_gate=0.3, normalise=True, blur=0.005)
 """The lobe averages over pixels already, and blur would widen what hides a bright surface by a pixel on either side."""
 
 
