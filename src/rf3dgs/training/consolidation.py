@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 
 import torch
+from scipy.ndimage import label
 from torch import Tensor
 
 from rf3dgs.geometry import Patches, Planes, Surfaces
@@ -22,6 +23,10 @@ TOGETHER = 0.08  # m
 THROUGH = 0.2  # m to both sides of a plane, within which its Gaussians stand
 OUTSIDE = 2  # cells by which an outline may lie outside
 SOLID = 0.2  # of a ray; Gaussians reach over an edge, and a mirror that is none costs more than one that is missing
+
+BESIDE = 0.03  # m off the rest of its plane, from which a piece is another thing's
+BENT, BOW = 0.6, 0.015  # 1 / m and m: what is rounder, and bulges more, is no mirror
+FEWEST = 12  # Gaussians that tell whether a piece is flat
 
 
 def surface_points(planes: Planes, patches: Patches, plane: int) -> Tensor:
@@ -58,6 +63,58 @@ def consolidated(surfaces: Surfaces, means: Tensor) -> Surfaces:
     plane_of = torch.where(surfaces.plane_of >= 0, whole[surfaces.plane_of.clamp_min(0)], -1)
     joined = replace(surfaces, patches=Patches.of(planes, points, patches.cell), plane_of=plane_of)
     return replace(joined, plane_of=with_skins(joined, means))
+
+
+def flat_pieces(surfaces: Surfaces, obstacles: Obstacles) -> Surfaces:
+    """The surfaces whose small planes are without pieces that are round or stand beside the others.
+
+    A column's front lies within centimetres of a board's far behind it, and passes for more of the same plane. A piece
+    is what hangs together but for gaps of a cell. It goes if its Gaussians, by a parabola through their heights over
+    the plane, bend with a radius under 1.7 m and by 1.5 cm, or if their median is 3 cm off that of the largest piece
+    which does not; where the plane itself lies is not asked.
+    """
+    planes, patches, plane_of = surfaces.planes, surfaces.patches, surfaces.plane_of.clone()
+    points, areas = [], patches.areas
+    for plane in range(len(planes)):
+        middles, grid = surface_points(planes, patches, plane), patches.grid(plane)
+        own = torch.nonzero((plane_of == plane) & (obstacles.opacities >= obstacles.min_opacity)).squeeze(-1)
+        if float(areas[plane]) < LARGE and len(own):
+            means = obstacles.means[own]
+            numbered, _ = label(widened(grid, 1).numpy(), [[1] * 3] * 3)  # type: ignore[misc]
+            pieces = torch.from_numpy(numbered)
+            row, column = patches.cell_of(means, torch.full_like(own, plane)).unbind(-1)
+            piece_of = pieces[row.clamp(0, len(grid) - 1), column.clamp(0, grid.shape[1] - 1)]
+            gone = _not_flat(means @ patches.axes[plane].mT, means @ planes.normals[plane], piece_of)
+            plane_of[own[torch.isin(piece_of, gone)]] = -1
+            middles = middles[~torch.isin(pieces[grid], gone)]
+        points.append(middles)
+    return replace(surfaces, patches=Patches.of(planes, points, patches.cell), plane_of=plane_of)
+
+
+def _not_flat(place: Tensor, height: Tensor, piece_of: Tensor) -> Tensor:
+    """The pieces of a plane that are not flat parts of it, by Gaussians at `place` `[n, 2]`, `height` `[n]` [m] in
+    pieces `piece_of` `[n]`, 0 for none. Of few Gaussians nothing is said."""
+    numbers, counts = piece_of[piece_of > 0].unique(return_counts=True)
+    told = numbers[counts >= FEWEST][counts[counts >= FEWEST].argsort(descending=True, stable=True)]
+    gone, level = [], None
+    for piece in told.tolist():
+        inside = piece_of == piece
+        median = float(height[inside].median())
+        if _is_round(place[inside], height[inside]) or (level is not None and abs(median - level) > BESIDE):
+            gone.append(piece)
+        elif level is None:
+            level = median
+    return torch.tensor(gone, dtype=piece_of.dtype)
+
+
+def _is_round(place: Tensor, height: Tensor) -> bool:
+    """Whether Gaussians at `place` `[n, 2]`, `height` `[n]` [m] over a plane lie on a thing round along either axis."""
+    u, v = (place - place.median(0).values).double().unbind(-1)
+    terms = torch.stack((torch.ones_like(u), u, v, u * u, u * v, v * v), -1)
+    found = torch.linalg.lstsq(terms, height.double()[:, None], driver="gelsd").solution[:, 0]
+    bend = 2 * found[[3, 5]].abs()
+    half = torch.stack((u.abs().quantile(0.8), v.abs().quantile(0.8)))
+    return bool(((bend > BENT) & (0.5 * bend * half.square() > BOW)).any())
 
 
 def outlined(planes: Planes, patches: Patches, obstacles: Obstacles) -> Patches:

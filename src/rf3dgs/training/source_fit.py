@@ -16,7 +16,7 @@ from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
-from rf3dgs.training.consolidation import consolidated, oblique_planes, outlined, squared, with_skins
+from rf3dgs.training.consolidation import consolidated, flat_pieces, oblique_planes, outlined, squared, with_skins
 from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
 from rf3dgs.training.marks import Paint, fit_marks
 from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_reflection, glints, silent_planes, silent_sources
@@ -25,7 +25,7 @@ from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, re
 
 PROBES = 150
 PROBE_MARGIN = 0.5
-GATES = (0.5, 0.3, 0.2, 0.1, 0.05)  # of transmittance; the first is what passes at a silhouette
+GATES = (0.3, 0.5, 0.2, 0.1, 0.05)  # of transmittance; the first is what passes beside a silhouette
 WORTH_A_CHANGE = 0.01  # share of what was looked at that another threshold must tell better
 UNTIMED = 5  # times as much is asked where no delay says whether a peak is the reflection
 SIGHT_WEIGHT = 3
@@ -82,8 +82,9 @@ def fit_sources(
         sources, surfaces, obstacles = _over(sources, with_timed(sources, timed), surfaces, obstacles)
     if config.square:
         surfaces = squared(surfaces)
-        obstacles = replace(obstacles, labels=surfaces.plane_of)
-        sources = replace(sources, planes=surfaces.planes, patches=surfaces.patches)
+    surfaces = flat_pieces(surfaces, obstacles)
+    obstacles = replace(obstacles, labels=surfaces.plane_of)
+    sources = replace(sources, planes=surfaces.planes, patches=surfaces.patches)
     sources = with_images(sources, probes, replace(config, order=1))
     peaks = peaks_of(spectra) if config.refine or config.complete else None
     if peaks is not None and config.refine:
@@ -181,7 +182,7 @@ def cleared_by(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles
 def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Obstacles) -> PointSources:
     """The sources with the threshold that agrees best with who sees the transmitter, and which reflections shine.
 
-    Silhouettes ask for one half; haze that stands everywhere may ask for less, and must say so clearly. A way that is
+    Outlines ask for 0.3, because rims of neighbours multiply; what asks for another must say so clearly. A way that is
     open and should not be counts twice: it misleads a beam, where one that is missing only costs its own power. The
     line of sight counts thrice. Peaks without a delay prove less.
     """
