@@ -23,7 +23,14 @@ from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.splats.surface import sample_mesh
 from rf3dgs.training.config import SourceConfig
-from rf3dgs.training.consolidation import oblique_planes, outlined, squared, surface_points
+from rf3dgs.training.consolidation import (
+    flat_pieces,
+    oblique_planes,
+    outlined,
+    squared,
+    surface_points,
+    with_both_faces,
+)
 from rf3dgs.training.marks import Paint, fit_marks
 from rf3dgs.training.radio_views import ruled
 from rf3dgs.training.reflection import Glints, fit_reflection, glints, on_time, outshone, ray_powers, silent_planes
@@ -423,6 +430,71 @@ def test_small_planes_that_nearly_stand_square_do():
     unknown = replace(room, planes=alone, patches=Patches.of(alone, points))
     assert squared(unknown) is unknown  # no wall says what is square
     assert not bool(oblique_planes(unknown.planes, unknown.patches).any())
+
+
+def things(*parts: tuple[torch.Tensor, int]) -> tuple[Surfaces, Obstacles]:
+    """Surfaces and obstacles of small opaque Gaussians at points `[n, 3]` that belong to planes x = 4 (number 0, facing
+    -x), or to none (-1)."""
+    means, label = torch.cat([points for points, _ in parts]), []
+    for points, number in parts:
+        label.append(torch.full((len(points),), number))
+    plane_of = torch.cat(label)
+    planes = Planes(torch.tensor([[-1.0, 0.0, 0.0]]), torch.tensor([-4.0]))
+    on_it = means[plane_of == 0] * torch.tensor([0.0, 1.0, 1.0]) + torch.tensor([4.0, 0.0, 0.0])
+    count = len(means)
+    normals = torch.tensor([-1.0, 0.0, 0.0]).expand(count, 3)
+    surfaces = Surfaces(planes, Patches.of(planes, [on_it]), plane_of, torch.zeros(count, dtype=torch.long), normals)
+    quats, scales = torch.tensor([1.0, 0, 0, 0]).expand(count, 4), torch.full((count, 3), 0.03)
+    return surfaces, Obstacles(means, quats, scales, torch.full((count,), 0.9), plane_of)
+
+
+def sheet(x: float, low: float, high: float, *, bulge: float = 0.0, seed: int = 0) -> torch.Tensor:
+    """Points of an upright sheet at `x` from y = `low` to `high`, a centimetre rough; its middle stands `bulge` out."""
+    generator = torch.Generator().manual_seed(seed)
+    y, z = (torch.rand(400, generator=generator) for _ in range(2))
+    out = bulge * (1 - (2 * y - 1).square())
+    rough = 0.01 * (torch.rand(400, generator=generator) - 0.5)
+    return torch.stack((x + rough - out, low + (high - low) * y, 1.8 * z), -1)
+
+
+def test_a_board_of_a_decimetre_has_two_faces_that_look_outwards():
+    front, back = sheet(3.94, 0.0, 2.0), sheet(4.05, 0.0, 2.0, seed=1)
+    surfaces, obstacles = things((front[:200], 0), (front[200:], -1), (back[:200], 0), (back[200:], -1))
+    both = with_both_faces(surfaces, obstacles)
+    assert both.planes.normals.tolist() == [[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+    assert both.planes.offsets.tolist() == pytest.approx([-3.94, 4.05], abs=0.005)
+    assert both.plane_of.tolist() == [0] * 400 + [1] * 400
+    assert both.patches.areas.tolist() == pytest.approx(surfaces.patches.areas.tolist() * 2, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [sheet(4.0, 0.0, 2.0, seed=1), sheet(4.03, 0.0, 2.0, seed=1), sheet(4.05, 2.5, 3.5, seed=1)],
+    ids=["the same", "closer than 5 cm", "beside it"],
+)
+def test_what_is_no_board_keeps_its_plane(other):
+    surfaces, obstacles = things((sheet(4.0, 0.0, 2.0), 0), (other, 0))
+    assert with_both_faces(surfaces, obstacles).planes.offsets.tolist() == [-4.0]
+
+
+def test_the_face_behind_another_that_looks_the_same_way_is_turned():
+    surfaces, obstacles = things((sheet(4.0, 0.0, 2.0), 0))
+    planes = Planes(torch.tensor([[-1.0, 0.0, 0.0]] * 2), torch.tensor([-4.0, -4.2]))
+    spots = surface_points(surfaces.planes, surfaces.patches, 0)
+    doubled = replace(surfaces, planes=planes, patches=Patches.of(planes, [spots, spots + torch.tensor([0.2, 0, 0])]))
+    both = with_both_faces(doubled, obstacles).planes
+    assert both.normals.tolist() == [[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+    assert both.offsets.tolist() == pytest.approx([-4.0, 4.2])
+
+
+def test_round_pieces_and_pieces_of_other_things_are_no_part_of_a_mirror():
+    board, column = sheet(4.0, 0.0, 1.0), sheet(4.0, 2.0, 2.6, bulge=0.05, seed=1)
+    shelf, more = sheet(4.06, 3.5, 4.0, seed=2), sheet(4.01, 5.0, 5.5, seed=3)
+    surfaces, obstacles = things((board, 0), (column, 0), (shelf, 0), (more, 0))
+    flat = flat_pieces(surfaces, obstacles)
+    assert bool((flat.plane_of.reshape(4, 400) == torch.tensor([[0], [-1], [-1], [0]])).all())
+    y = surface_points(flat.planes, flat.patches, 0)[:, 1]
+    assert bool((((y > -0.1) & (y < 1.1)) | ((y > 4.9) & (y < 5.6))).all())
 
 
 def test_marks_are_left_out_where_planes_are_uniform(fitted):

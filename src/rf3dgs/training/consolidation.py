@@ -27,6 +27,9 @@ SOLID = 0.2  # of a ray; Gaussians reach over an edge, and a mirror that is none
 BESIDE = 0.03  # m off the rest of its plane, from which a piece is another thing's
 BENT, BOW = 0.6, 0.015  # 1 / m and m: what is rounder, and bulges more, is no mirror
 FEWEST = 12  # Gaussians that tell whether a piece is flat
+THIN, APART = 0.05, 3.5  # m between two faces, and how many median deviations of each
+HALF = 0.5  # of the cells of one face must have the other one across
+DEEPEST = 0.3  # m between the faces of a board
 
 
 def surface_points(planes: Planes, patches: Patches, plane: int) -> Tensor:
@@ -63,6 +66,78 @@ def consolidated(surfaces: Surfaces, means: Tensor) -> Surfaces:
     plane_of = torch.where(surfaces.plane_of >= 0, whole[surfaces.plane_of.clamp_min(0)], -1)
     joined = replace(surfaces, patches=Patches.of(planes, points, patches.cell), plane_of=plane_of)
     return replace(joined, plane_of=with_skins(joined, means))
+
+
+def with_both_faces(surfaces: Surfaces, obstacles: Obstacles) -> Surfaces:
+    """The surfaces with the two faces of boards apart, each facing outwards.
+
+    What is a decimetre thick comes out of photographs as one plane in its middle, or as two that face the same way, and
+    the image in a mirror that stands 6 cm off is 12 cm off. Gaussians before and behind a small plane, up to 15 cm, are
+    of two faces where their heights fall into two, 5 cm apart and 3.5 median deviations of either, and half of one
+    face has the other one across. Those behind become a plane of their own that faces the other way; both stand where
+    their Gaussians do. Planes keep their numbers, new ones follow.
+    """
+    planes, patches, plane_of = surfaces.planes, surfaces.patches, surfaces.plane_of.clone()
+    areas, points = patches.areas, [surface_points(planes, patches, plane) for plane in range(len(planes))]
+    normals, offsets = list(planes.normals), list(planes.offsets)
+    large = torch.cat((areas >= LARGE, torch.zeros(1, dtype=torch.bool)))  # the last for the label -1
+    free = (obstacles.opacities >= obstacles.min_opacity) & ~large[plane_of]
+    for plane in range(len(planes)):
+        if not 0 < float(areas[plane]) < LARGE or not len(points[plane]):
+            continue
+        near = (obstacles.means @ normals[plane] - offsets[plane]).abs() < DEEPEST / 2
+        near &= free & ((surfaces.normals @ normals[plane]).abs() > SKIN_ANGLE)
+        own = torch.nonzero(near).squeeze(-1)
+        own = own[patches.holds(obstacles.means[own], torch.full_like(own, plane))]
+        height = obstacles.means[own] @ normals[plane]
+        behind = _lower(height)
+        if behind is None:
+            continue
+        faces = [_beside(points[plane], obstacles.means[own[side]], patches.cell) for side in (~behind, behind)]
+        if int((faces[0] & faces[1]).sum()) < HALF * min(int(face.sum()) for face in faces):
+            continue
+        plane_of[own] = torch.where(behind, len(normals), plane)
+        offsets[plane] = height[~behind].median()
+        offsets.append(-height[behind].median())
+        normals.append(-normals[plane])
+        points.append(points[plane][faces[1]])
+        points[plane] = points[plane][faces[0]]
+    for plane in range(len(planes)):
+        for other in range(len(planes)):
+            behind = float(offsets[other] - offsets[plane])
+            small = len(points[plane]) and max(float(areas[plane]), float(areas[other])) < LARGE
+            if not small or not BESIDE < behind < DEEPEST or float(normals[plane] @ normals[other]) < PIECE_ANGLE:
+                continue
+            across = _beside(points[plane], points[other] - behind * normals[other], patches.cell)
+            if float(across.float().mean()) > HALF:
+                normals[plane], offsets[plane] = -normals[plane], -offsets[plane]
+                break
+    both = Planes(torch.stack(normals), torch.stack(offsets)) if normals else planes
+    flat = [
+        part - (part @ both.normals[at] - both.offsets[at])[:, None] * both.normals[at]
+        for at, part in enumerate(points)
+    ]
+    return replace(surfaces, planes=both, patches=Patches.of(both, flat, patches.cell), plane_of=plane_of)
+
+
+def _lower(height: Tensor) -> Tensor | None:
+    """Which of `height` `[n]` [m] are of the lower of two faces; None where there is one, or too few to tell."""
+    if len(height) < 2 * FEWEST:
+        return None
+    ordered = height.double().sort().values
+    count = torch.arange(1, len(ordered))
+    below, total = ordered.cumsum(0)[:-1], ordered.sum()
+    between = count * (len(ordered) - count) * (below / count - (total - below) / (len(ordered) - count)).square()
+    at = int(between[FEWEST - 1 : len(between) - FEWEST + 1].argmax()) + FEWEST  # Otsu's threshold
+    low, high = ordered[:at], ordered[at:]
+    spread = max(float((part - part.median()).abs().median()) for part in (low, high))
+    apart = float(high.median() - low.median())
+    return height <= ordered[at - 1] if apart > max(THIN, APART * spread) else None
+
+
+def _beside(cells: Tensor, points: Tensor, cell: float) -> Tensor:
+    """Which middles of `cells` `[n, 3]` have one of `points` `[m, 3]` within two cells, thickness aside."""
+    return torch.cdist(cells, points).amin(1) < 2 * cell if len(points) else torch.zeros(len(cells), dtype=torch.bool)
 
 
 def flat_pieces(surfaces: Surfaces, obstacles: Obstacles) -> Surfaces:

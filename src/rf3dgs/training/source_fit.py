@@ -16,7 +16,15 @@ from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
-from rf3dgs.training.consolidation import consolidated, flat_pieces, oblique_planes, outlined, squared, with_skins
+from rf3dgs.training.consolidation import (
+    consolidated,
+    flat_pieces,
+    oblique_planes,
+    outlined,
+    squared,
+    with_both_faces,
+    with_skins,
+)
 from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
 from rf3dgs.training.marks import Paint, fit_marks
 from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_reflection, glints, silent_planes, silent_sources
@@ -74,7 +82,7 @@ def fit_sources(
         obstacles = replace(obstacles, labels=None).cleared(tx.position.expand_as(positions[seen]), positions[seen])
         return SourceFit(direct, seen, direct.rays_each(positions, obstacles, in_sight=seen), obstacles)
     probes = torch.cat((positions, _probes(positions, config.seed)))
-    surfaces = consolidated(surfaces, obstacles.means)
+    surfaces = with_both_faces(consolidated(surfaces, obstacles.means), obstacles)
     obstacles = replace(obstacles, labels=surfaces.plane_of)
     sources = _known(direct, surfaces)
     timed = timed_mirrors(spectra, tx.position) if config.complete else []
