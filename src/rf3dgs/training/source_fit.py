@@ -33,7 +33,7 @@ from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, re
 
 PROBES = 150
 PROBE_MARGIN = 0.5
-GATES = (0.3, 0.5, 0.2, 0.1, 0.05)  # of transmittance; the first is what passes beside a silhouette
+GATES = (0.4, 0.5, 0.3, 0.2, 0.1, 0.05)  # of transmittance; the first is what passes beside a silhouette
 WORTH_A_CHANGE = 0.01  # share of what was looked at that another threshold must tell better
 UNTIMED = 5  # times as much is asked where no delay says whether a peak is the reflection
 SIGHT_WEIGHT = 3
@@ -190,7 +190,7 @@ def cleared_by(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles
 def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Obstacles) -> PointSources:
     """The sources with the threshold that agrees best with who sees the transmitter, and which reflections shine.
 
-    Outlines ask for 0.3, because rims of neighbours multiply; what asks for another must say so clearly. A way that is
+    Outlines ask for 0.3 to 0.5, which 40 positions do not tell apart; what asks for another must say so clearly. A way that is
     open and should not be counts twice: it misleads a beam, where one that is missing only costs its own power. The
     line of sight counts thrice. Peaks without a delay prove less.
     """
