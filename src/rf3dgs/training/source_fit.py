@@ -190,9 +190,9 @@ def cleared_by(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles
 def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Obstacles) -> PointSources:
     """The sources with the threshold that agrees best with who sees the transmitter, and which reflections shine.
 
-    Outlines ask for 0.3 to 0.5, which 40 positions do not tell apart; what asks for another must say so clearly. A way that is
-    open and should not be counts twice: it misleads a beam, where one that is missing only costs its own power. The
-    line of sight counts thrice. Peaks without a delay prove less.
+    Outlines ask for 0.3 to 0.5, which 40 positions do not tell apart; what asks for another must say so clearly. A way
+    that is open and should not be counts twice: it misleads a beam, where one that is missing only costs its own power.
+    The line of sight counts thrice. Peaks without a delay prove less.
     """
     ways = [sources.candidates(position, obstacles) for position in spectra.pose.position]
     looked = glints(sources, [rays for rays, _ in ways], spectra)
