@@ -17,6 +17,7 @@ from rf3dgs.field.rays import RAY_FIELDS, Rays
 from rf3dgs.field.sources import PointSources
 from rf3dgs.geometry import Patches, Planes, Surfaces, find_surfaces
 from rf3dgs.propagation.room import shoebox
+from rf3dgs.propagation.sites.shapes import box
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.gaussians import Gaussians
@@ -34,7 +35,7 @@ from rf3dgs.training.consolidation import (
 from rf3dgs.training.marks import Paint, fit_marks
 from rf3dgs.training.radio_views import ruled
 from rf3dgs.training.reflection import Glints, fit_reflection, glints, on_time, outshone, ray_powers, silent_planes
-from rf3dgs.training.source_fit import GATES, _gated, fit_sources
+from rf3dgs.training.source_fit import USUAL, USUAL_OF_MESHES, _gated, fit_sources
 from rf3dgs.training.timed_mirrors import timed_mirrors, with_timed
 from rf3dgs.training.virtual import Mirror
 
@@ -216,11 +217,30 @@ def test_the_gate_asks_more_proof_of_peaks_without_delay(fitted, spectra):
     """Haze in four of sixteen lines of sight: with delays that is enough for a lower gate, without it is not."""
     middles = 0.5 * (TX + spectra.pose.position[::4])
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(4, 4).contiguous()
-    lumps = Obstacles(middles, quats, torch.full((4, 3), 0.03), torch.full((4,), 0.65))
+    lumps = Obstacles(middles, quats, torch.full((4, 3), 0.03), torch.tensor([0.649, 0.65, 0.651, 0.652]))
     assert bool(fitted.seen.all())
     assert _gated(fitted.sources, spectra, fitted.seen, lumps).open_above == 0.3  # the highest gate that 0.35 passes
     untimed = replace(spectra, delay=None, aod=None)
-    assert _gated(fitted.sources, untimed, fitted.seen, lumps).open_above == GATES[0]
+    assert _gated(fitted.sources, untimed, fitted.seen, lumps).open_above == USUAL
+    sampled = replace(lumps, opacities=torch.full((4,), 0.65))
+    assert _gated(fitted.sources, untimed, fitted.seen, sampled).open_above == USUAL_OF_MESHES
+
+
+@pytest.mark.parametrize("spacing", [0.06, 0.1, 0.15])
+def test_the_gate_of_meshes_opens_within_three_centimetres_of_an_edge(spacing):
+    """Half of a ray passes only 3 to 5 cm beside the edge of a sampled box; nothing does within it."""
+    vertices, faces, _ = box((-0.3, -0.3, 0.0), (0.3, 0.3, 3.5))
+    post = sample_mesh(vertices, faces, spacing=spacing, thickness=0.007)
+    obstacles = Obstacles(post.means, post.quats, post.scales, post.opacities)
+    height = torch.linspace(0.5, 3.0, 60)
+
+    def passed(beside: float) -> float:
+        start = torch.stack((torch.full((60,), -5.0), torch.full((60,), 0.3 + beside), height), -1)
+        return float(obstacles.transmittance(start, start * torch.tensor([-1.0, 1.0, 1.0])).median())
+
+    assert passed(-0.01) < 0.05
+    assert passed(0.03) > USUAL_OF_MESHES
+    assert passed(0.02) < 0.5
 
 
 def test_what_hides_a_reflection_that_shines_is_cleared(spectra):

@@ -33,7 +33,9 @@ from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, re
 
 PROBES = 150
 PROBE_MARGIN = 0.5
-GATES = (0.4, 0.5, 0.3, 0.2, 0.1, 0.05)  # of transmittance; the first is what passes beside a silhouette
+GATES = (0.5, 0.4, 0.3, 0.2, 0.1, 0.05)  # of transmittance
+USUAL, USUAL_OF_MESHES = 0.4, 0.1  # what passes beside outlines
+OF_MESHES = 0.9  # of the Gaussians of a mesh have one and the same opacity
 WORTH_A_CHANGE = 0.01  # share of what was looked at that another threshold must tell better
 UNTIMED = 5  # times as much is asked where no delay says whether a peak is the reflection
 SIGHT_WEIGHT = 3
@@ -190,8 +192,9 @@ def cleared_by(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles
 def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Obstacles) -> PointSources:
     """The sources with the threshold that agrees best with who sees the transmitter, and which reflections shine.
 
-    Outlines ask for 0.3 to 0.5, which 40 positions do not tell apart; what asks for another must say so clearly. A way
-    that is open and should not be counts twice: it misleads a beam, where one that is missing only costs its own power.
+    Outlines of photographs ask for 0.3 to 0.5, which 40 positions do not tell apart, those of Gaussians sampled on a
+    mesh for 0.1: 2 cm beside an edge 0.2 passes. What asks for another must say so clearly. A way that is open and
+    should not be counts twice: it misleads a beam, where one that is missing only costs its own power.
     The line of sight counts thrice. Peaks without a delay prove less.
     """
     ways = [sources.candidates(position, obstacles) for position in spectra.pose.position]
@@ -206,8 +209,10 @@ def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Ob
     wrong = wrong + 2 * ((shone > gates) & ~glints_seen).sum(-1) + ((shone <= gates) & glints_seen).sum(-1)
     proof = WORTH_A_CHANGE * (UNTIMED if spectra.delay is None else 1)
     worth = proof * (SIGHT_WEIGHT * len(seen) + len(shone))
-    best = int(wrong.argmin())
-    return replace(sources, open_above=GATES[best if int(wrong[best]) < int(wrong[0]) - worth else 0])
+    _, alike = obstacles.opacities.unique(return_counts=True)
+    sampled = bool((alike > OF_MESHES * len(obstacles.opacities)).any())
+    usual, best = GATES.index(USUAL_OF_MESHES if sampled else USUAL), int(wrong.argmin())
+    return replace(sources, open_above=GATES[best if int(wrong[best]) < int(wrong[usual]) - worth else usual])
 
 
 def _refined(
