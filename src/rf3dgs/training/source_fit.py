@@ -194,8 +194,9 @@ def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Ob
 
     Outlines of photographs ask for 0.3 to 0.5, which 40 positions do not tell apart, those of Gaussians sampled on a
     mesh for 0.1: 2 cm beside an edge 0.2 passes. What asks for another must say so clearly. A way that is open and
-    should not be counts twice: it misleads a beam, where one that is missing only costs its own power.
-    The line of sight counts thrice. Peaks without a delay prove less.
+    should not be counts twice: it misleads a beam, where one that is missing only costs its own power. The line of
+    sight counts thrice. Peaks without a delay prove less, and mirrors found by them are less sure: their ways stay
+    closed rather than open.
     """
     ways = [sources.candidates(position, obstacles) for position in spectra.pose.position]
     looked = glints(sources, [rays for rays, _ in ways], spectra)
@@ -210,7 +211,7 @@ def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Ob
     proof = WORTH_A_CHANGE * (UNTIMED if spectra.delay is None else 1)
     worth = proof * (SIGHT_WEIGHT * len(seen) + len(shone))
     _, alike = obstacles.opacities.unique(return_counts=True)
-    sampled = bool((alike > OF_MESHES * len(obstacles.opacities)).any())
+    sampled = bool((alike > OF_MESHES * len(obstacles.opacities)).any()) and spectra.delay is not None
     usual, best = GATES.index(USUAL_OF_MESHES if sampled else USUAL), int(wrong.argmin())
     return replace(sources, open_above=GATES[best if int(wrong[best]) < int(wrong[usual]) - worth else usual])
 
