@@ -1,6 +1,7 @@
-"""Large planes made whole: photographs leave walls in pieces that lie a little beside each other.
+"""Planes of photographs made fit for mirrors: walls whole, boards with two faces, small things square, flat and outlined.
 
-For mirrors a wall is one plane, and none of the Gaussians that stand for it may stand in the way of its own reflection.
+Photographs leave walls in pieces that lie a little beside each other; for mirrors a wall is one plane, and none of the
+Gaussians that stand for it may stand in the way of its own reflection.
 """
 
 import math
