@@ -1,4 +1,4 @@
-"""Planes of photographs made fit for mirrors: walls whole, boards with two faces, small things square, flat and outlined.
+"""Planes of photographs made fit for mirrors: walls whole, boards of two faces, small things square, flat, outlined.
 
 Photographs leave walls in pieces that lie a little beside each other; for mirrors a wall is one plane, and none of the
 Gaussians that stand for it may stand in the way of its own reflection.
@@ -24,7 +24,6 @@ TOGETHER = 0.08  # m
 THROUGH = 0.2  # m to both sides of a plane, within which its Gaussians stand
 OUTSIDE = 2  # cells by which an outline may lie outside
 SOLID = 0.2  # of a ray; Gaussians reach over an edge, and a mirror that is none costs more than one that is missing
-
 BESIDE = 0.03  # m off the rest of its plane, from which a piece is another thing's
 BENT, BOW = 0.6, 0.015  # 1 / m and m: what is rounder, and bulges more, is no mirror
 FEWEST = 12  # Gaussians that tell whether a piece is flat
