@@ -5,6 +5,7 @@ Gaussians that stand for it may stand in the way of its own reflection.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -102,22 +103,29 @@ def with_both_faces(surfaces: Surfaces, obstacles: Obstacles) -> Surfaces:
         normals.append(-normals[plane])
         points.append(points[plane][faces[1]])
         points[plane] = points[plane][faces[0]]
-    for plane in range(len(planes)):
-        for other in range(len(planes)):
-            behind = float(offsets[other] - offsets[plane])
-            small = len(points[plane]) and max(float(areas[plane]), float(areas[other])) < LARGE
-            if not small or not BESIDE < behind < DEEPEST or float(normals[plane] @ normals[other]) < PIECE_ANGLE:
-                continue
-            across = _beside(points[plane], points[other] - behind * normals[other], patches.cell)
-            if float(across.float().mean()) > HALF:
-                normals[plane], offsets[plane] = -normals[plane], -offsets[plane]
-                break
+    _turn_outwards(normals, offsets, points, areas, patches.cell)
     both = Planes(torch.stack(normals), torch.stack(offsets)) if normals else planes
     flat = [
         part - (part @ both.normals[at] - both.offsets[at])[:, None] * both.normals[at]
         for at, part in enumerate(points)
     ]
     return replace(surfaces, planes=both, patches=Patches.of(both, flat, patches.cell), plane_of=plane_of)
+
+
+def _turn_outwards(
+    normals: list[Tensor], offsets: list[Tensor], points: Sequence[Tensor], areas: Tensor, cell: float
+) -> None:
+    """Turn those of the small planes with `areas` `[plane]` that lie behind another and face the same way, in place."""
+    for plane in range(len(areas)):
+        for other in range(len(areas)):
+            behind = float(offsets[other] - offsets[plane])
+            small = len(points[plane]) and max(float(areas[plane]), float(areas[other])) < LARGE
+            if not small or not BESIDE < behind < DEEPEST or float(normals[plane] @ normals[other]) < PIECE_ANGLE:
+                continue
+            across = _beside(points[plane], points[other] - behind * normals[other], cell)
+            if float(across.float().mean()) > HALF:
+                normals[plane], offsets[plane] = -normals[plane], -offsets[plane]
+                break
 
 
 def _lower(height: Tensor) -> Tensor | None:
@@ -155,8 +163,8 @@ def flat_pieces(surfaces: Surfaces, obstacles: Obstacles) -> Surfaces:
         own = torch.nonzero((plane_of == plane) & (obstacles.opacities >= obstacles.min_opacity)).squeeze(-1)
         if float(areas[plane]) < LARGE and len(own):
             means = obstacles.means[own]
-            numbered, _ = label(widened(grid, 1).numpy(), [[1] * 3] * 3)  # type: ignore[misc]
-            pieces = torch.from_numpy(numbered)
+            pieces = torch.zeros(grid.shape, dtype=torch.int32)
+            label(widened(grid, 1).numpy(), [[1] * 3] * 3, output=pieces.numpy())
             row, column = patches.cell_of(means, torch.full_like(own, plane)).unbind(-1)
             piece_of = pieces[row.clamp(0, len(grid) - 1), column.clamp(0, grid.shape[1] - 1)]
             gone = _not_flat(means @ patches.axes[plane].mT, means @ planes.normals[plane], piece_of)
