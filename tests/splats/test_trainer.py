@@ -10,6 +10,7 @@ from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, equirect_grid, pinhole_grid, view_of
 from rf3dgs.splats.compositing import Compositing
+from rf3dgs.splats.constants import BLUR
 from rf3dgs.splats.density import Change
 from rf3dgs.splats.draw import draw
 from rf3dgs.splats.gaussians import Gaussians
@@ -119,11 +120,12 @@ def test_extra_channels_depth_and_background_are_drawn_and_trained_through():
     assert_same_movement(native, precise, start, 3e-3)
 
 
+@pytest.mark.parametrize("blur", [BLUR, 3.0])
 @pytest.mark.parametrize("normalise", [False, True])
 @pytest.mark.parametrize("transfer", ["identity", "db_window", ("db_window", "identity", "db_window")])
-def test_finished_pictures_and_their_gradients_agree(normalise: bool, transfer):
+def test_finished_pictures_and_their_gradients_agree(normalise: bool, transfer, blur: float):
     start, view = cloud(channels=3), cameras()[1]
-    how = Compositing(normalise=normalise, transfer=transfer, floor_db=-20.0, ceil_db=5.0)
+    how = Compositing(normalise=normalise, transfer=transfer, floor_db=-20.0, ceil_db=5.0, blur=blur)
     native, precise = pair(start, train=EVERYTHING, eps=1e-4)
     generator = torch.Generator().manual_seed(5)
     added = 0.3 * torch.rand(33, 45, 3, generator=generator)
@@ -179,7 +181,7 @@ def test_what_is_frozen_does_not_change_a_bit():
     assert not torch.equal(found["logit_opacities"], start["logit_opacities"])
 
 
-@pytest.mark.parametrize("how", [Compositing(), Compositing(normalise=True), WINDOW])
+@pytest.mark.parametrize("how", [Compositing(), Compositing(normalise=True), Compositing(blur=3.0), WINDOW])
 def test_a_step_is_drawing_loss_and_update_bit_by_bit(how: Compositing):
     whole, parts = (Trainer(**cloud(channels=3), train=EVERYTHING) for _ in range(2))
     for view in cameras():

@@ -144,7 +144,7 @@ def _lower(height: Tensor) -> Tensor | None:
 
 
 def _beside(cells: Tensor, points: Tensor, cell: float) -> Tensor:
-    """Which middles of `cells` `[n, 3]` have one of `points` `[m, 3]` within two cells, thickness aside."""
+    """Which middles of `cells` `[n, 3]` [m] have one of `points` `[m, 3]` within two widths of a `cell` [m]."""
     return torch.cdist(cells, points).amin(1) < 2 * cell if len(points) else torch.zeros(len(cells), dtype=torch.bool)
 
 
