@@ -14,7 +14,7 @@ from torch import Tensor
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.native import native_core
 from rf3dgs.splats.gaussians import Gaussians
-from rf3dgs.splats.obstacles import Obstacles, visibility_of
+from rf3dgs.splats.obstacles import CLEAR, Obstacles, visibility_of
 from rf3dgs.splats.surface import sample_mesh
 from rf3dgs.splats.transmittance import segment_transmittance
 
@@ -262,7 +262,8 @@ def test_a_segment_that_is_known_to_be_free_is_cleared(seed: int) -> None:
     some = {name: skip[100:160] for name, skip in skips.items()}
     start, end = start[100:160], end[100:160]
     before = obstacles.transmittance(start, end, **some)
-    cleared = obstacles.cleared(start, end, **some)
+    every = torch.ones(len(start), dtype=torch.bool)
+    cleared = obstacles.cleared(start, end, every, **some)
     after = cleared.transmittance(start, end, **some)
     assert float(before.min()) < 0.5
     assert bool((after >= before - TOLERANCE).all())
@@ -271,20 +272,38 @@ def test_a_segment_that_is_known_to_be_free_is_cleared(seed: int) -> None:
     assert bool((cleared.opacities <= obstacles.opacities).all())
     # Alone in its segment, a Gaussian in the middle of it keeps a twentieth, which counts as nothing.
     lump = Obstacles(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.1), torch.tensor([0.9]))
-    ends = torch.tensor([[-1.0, 0, 0]]), torch.tensor([[1.0, 0, 0]])
-    assert float(lump.cleared(*ends).opacities) == pytest.approx(0.05, rel=1e-5)
-    aside = torch.tensor([0.0, 0.2, 0.0])  # two standard deviations off: 0.05 / exp(-2)
-    assert float(lump.cleared(ends[0] + aside, ends[1] + aside).opacities) == pytest.approx(
-        0.05 * math.exp(2), rel=1e-4
+    ends, free = (torch.tensor([[-1.0, 0, 0]]), torch.tensor([[1.0, 0, 0]])), torch.tensor([True])
+    assert float(lump.cleared(*ends, free).opacities) == pytest.approx(CLEAR, rel=1e-5)
+    aside = torch.tensor([0.0, 0.15, 0.0])  # one and a half standard deviations off: CLEAR / exp(-1.5^2 / 2)
+    assert float(lump.cleared(ends[0] + aside, ends[1] + aside, free).opacities) == pytest.approx(
+        CLEAR * math.exp(1.125), rel=1e-4
     )
     far = torch.tensor([0.0, 0.6, 0.0])
-    assert float(lump.cleared(ends[0] + far, ends[1] + far).opacities) == pytest.approx(0.9)
+    assert float(lump.cleared(ends[0] + far, ends[1] + far, free).opacities) == pytest.approx(0.9)
     nowhere = torch.tensor([[float("nan"), 0, 0]]), torch.tensor([[float("inf"), 0, 0]])
-    assert float(lump.cleared(*nowhere).opacities) == pytest.approx(0.9)
+    assert float(lump.cleared(*nowhere, free).opacities) == pytest.approx(0.9)
     with pytest.raises(InputError, match="stop_short must be a length"):
-        lump.cleared(*ends, stop_short=-0.1)
+        lump.cleared(*ends, free, stop_short=-0.1)
     labelled = replace(lump, labels=torch.tensor([4]))
-    assert float(labelled.cleared(*ends, skip_start=torch.tensor([4])).opacities) == pytest.approx(0.9)
+    assert float(labelled.cleared(*ends, free, skip_start=torch.tensor([4])).opacities) == pytest.approx(0.9)
+
+
+def test_what_closed_segments_need_is_not_cleared() -> None:
+    """A thin thing in a free segment goes; a wall that stops two closed ones stays, though one free segment meets it."""
+    cloud = plate(2.0)  # across the x axis
+    wall, count = obstacles_of(cloud), len(cloud.means)
+    thing = Obstacles(*(torch.cat((part, part[:1])) for part in (wall.means, wall.quats, wall.scales, wall.opacities)))
+    thing.means[-1] = torch.tensor([1.0, 0.0, 1.5])
+    start = torch.tensor([[0.0, 0.0, 1.5]]).expand(3, 3)
+    end = torch.tensor([[3.0, 0.0, 1.5], [3.0, 0.01, 1.5], [3.0, -0.01, 1.5]])
+    kept = thing.cleared(start, end, torch.tensor([True, False, False]))
+    assert torch.equal(kept.opacities[:count], thing.opacities[:count])
+    near = torch.tensor([[0.0, 0.0, 1.5], [0.0, 0.0, 1.5]]), torch.tensor([[1.8, 0.0, 1.5], [3.0, 0.5, 1.5]])
+    gone = thing.cleared(*near, torch.tensor([True, False]))
+    assert float(gone.opacities[-1]) == pytest.approx(CLEAR, rel=1e-4)
+    assert torch.equal(gone.opacities[:count], thing.opacities[:count])
+    with pytest.raises(InputError, match=r"free must be \[segment\] for 2 segments; got \[3\]"):
+        thing.cleared(*near, torch.ones(3, dtype=torch.bool))
 
 
 def test_wrong_shapes_and_missing_labels_are_refused() -> None:

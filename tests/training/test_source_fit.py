@@ -12,6 +12,7 @@ from rf3dgs.core.angles import angle_between
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid
+from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.field.images import sequences
 from rf3dgs.field.rays import RAY_FIELDS, Rays
 from rf3dgs.field.sources import PointSources
@@ -161,7 +162,7 @@ def test_a_wall_that_geometry_lacks_is_found_from_the_peaks(spectra):
 
 def test_delay_and_departure_of_single_peaks_tell_the_walls(spectra):
     """Six images of one reflection, each in its place; what two or three reflections made is not taken for a wall."""
-    truth, found = walls().planes, timed_mirrors(spectra, TX)
+    truth, found = walls().planes, timed_mirrors(spectra, TX, walls().planes.normals)
     assert len(found) == 6
     for mirror in found:
         plane = int((truth.normals @ mirror.normal).argmax())
@@ -169,7 +170,26 @@ def test_delay_and_departure_of_single_peaks_tell_the_walls(spectra):
         assert float(truth.normals[plane] @ mirror.normal) > math.cos(math.radians(0.5))
         assert abs(float(truth.offsets[plane] - mirror.offset)) < 0.03
         assert float((mirror.points @ truth.normals[plane] - truth.offsets[plane]).abs().max()) < 0.05
-    assert timed_mirrors(replace(spectra, delay=None, aod=None), TX) == []
+    assert timed_mirrors(replace(spectra, delay=None, aod=None), TX, walls().planes.normals) == []
+
+
+def test_what_a_board_and_the_floor_reflect_is_no_tilted_mirror():
+    """Of the east wall only its reflections over the floor are seen: one mirror through the edge would do the same."""
+    pose, paths = receivers(40, 0), traced(receivers(40, 0))
+    floored, both = TX * torch.tensor([1.0, 1.0, -1.0]), torch.tensor([2 * SIZE[0] - TX[0], TX[1], -TX[2]])
+    place = pose.position[:, None] + SPEED_OF_LIGHT * paths.delay[..., None] * paths.aoa
+    kept = (torch.cdist(place, torch.stack((TX, floored, both))) < 0.01).any(-1)
+    shown = spectrum_of(
+        replace(paths, coeff=torch.where(kept, paths.coeff, 0.0)),
+        *(None, equirect_grid(180, 90)),
+        lobe=math.radians(4.0),
+    )
+    floor = torch.tensor([0.0, 0.0, 1.0])
+    (known,) = timed_mirrors(shown, TX, walls().planes.normals)
+    assert float(known.normal @ floor) > math.cos(math.radians(0.5))
+    first, second = timed_mirrors(shown, TX, torch.zeros(0, 3))  # without walls nothing tells it from a tilted one
+    assert float(first.normal @ floor) > math.cos(math.radians(0.5))
+    assert 0.2 < float(second.normal @ floor) < 0.5
 
 
 def test_a_wall_far_from_its_place_is_moved_into_it(spectra):

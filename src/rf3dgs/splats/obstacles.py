@@ -19,6 +19,7 @@ from rf3dgs.splats.transmittance import coverage, segment_transmittance
 
 SOFT_RADIUS = 0.02  # m
 CLEAR = 0.05  # most that a Gaussian may stop of a segment that is known to be free
+NEGLIGIBLE, OPAQUE = 1e-3, 0.999  # shares that a Gaussian stops
 RAYS = 7  # of a soft gate
 FEW = 256  # segments that are answered sooner than other threads wake
 _SOFT_CHUNK = 200_000  # segments
@@ -92,27 +93,43 @@ class Obstacles:
         self,
         start: Tensor,
         end: Tensor,
+        free: Tensor,
         *,
         skip_start: Tensor | None = None,
         skip_end: Tensor | None = None,
         stop_short: float = 0.10,
     ) -> "Obstacles":
-        """The obstacles without what stands in segments that are known to be free; arguments as of `transmittance`.
+        """The obstacles without what stands in segments that are known to be `free` `[segment]`; False says that
+        something does stand there. Arguments as of `transmittance`.
 
-        Gaussians that a segment meets become fainter, the more the nearer they are to it, until none of them stops
-        more than `CLEAR`.
+        What a segment does not let pass speaks against or for the Gaussians on it, in parts as they stop it. Those
+        against which more is said become fainter, until none of them stops more than `CLEAR` of a free segment.
         """
         start, end, *skips = self._asked(start, end, skip_start, skip_end, stop_short)
-        solid = self.opacities > CLEAR
+        if free.shape != (len(start),):
+            raise InputError(f"free must be [segment] for {len(start)} segments; got {list(free.shape)}")
+        solid = self.opacities >= self.min_opacity
+        parts = [
+            [column[covered > NEGLIGIBLE] for column in (segment, gaussian, covered)]
+            for segment, gaussian, covered in coverage(
+                *(self.means, self.quats, self.scales, solid, start.to(self.means.dtype), end.to(self.means.dtype)),
+                labels=self.labels,
+                skips=[skip for skip in skips if skip is not None],
+                stop_short=stop_short,
+            )
+        ]
+        if not parts:
+            return self
+        segment, gaussian, covered = (torch.cat(column) for column in zip(*parts, strict=True))
+        depth = -torch.log1p(-(self.opacities[gaussian] * covered).clamp_max(OPAQUE))
+        whole = torch.zeros(len(start)).index_add_(0, segment, depth)
+        part = depth / whole[segment] * (1 - torch.exp(-whole[segment]))
+        against = torch.where(free[segment], part, -part)
+        doubted = torch.zeros_like(self.opacities).index_add_(0, gaussian, against) > 0
         widest = torch.zeros_like(self.opacities)
-        for _, gaussian, covered in coverage(
-            *(self.means, self.quats, self.scales, solid, start.to(self.means.dtype), end.to(self.means.dtype)),
-            labels=self.labels,
-            skips=[skip for skip in skips if skip is not None],
-            stop_short=stop_short,
-        ):
-            widest.scatter_reduce_(0, gaussian, covered, "amax")
-        return replace(self, opacities=torch.minimum(self.opacities, CLEAR / widest.clamp_min(1e-12)))
+        widest.scatter_reduce_(0, gaussian, torch.where(free[segment], covered, 0.0), "amax")
+        limit = torch.where(doubted, CLEAR / widest.clamp_min(1e-12), 1.0)
+        return replace(self, opacities=torch.minimum(self.opacities, limit))
 
     def soft(
         self,

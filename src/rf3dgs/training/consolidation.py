@@ -26,11 +26,13 @@ THROUGH = 0.2  # m to both sides of a plane, within which its Gaussians stand
 OUTSIDE = 2  # cells by which an outline may lie outside
 SOLID = 0.2  # of a ray; Gaussians reach over an edge, and a mirror that is none costs more than one that is missing
 BESIDE = 0.03  # m off the rest of its plane, from which a piece is another thing's
+NARROW = 0.16  # m, half the width of a strip that is no mirror: a round column shows one
 BENT, BOW = 0.6, 0.015  # 1 / m and m: what is rounder, and bulges more, is no mirror
 FEWEST = 12  # Gaussians that tell whether a piece is flat
 THIN, APART = 0.05, 3.5  # m between two faces, and how many median deviations of each
 HALF = 0.5  # of the cells of one face must have the other one across
 DEEPEST = 0.3  # m between the faces of a board
+FOOT, STEEP = 0.3, 0.5  # m between a board and what it stands on, and least square of the sine of their angle
 
 
 def surface_points(planes: Planes, patches: Patches, plane: int) -> Tensor:
@@ -183,11 +185,17 @@ def _not_flat(place: Tensor, height: Tensor, piece_of: Tensor) -> Tensor:
     for piece in told.tolist():
         inside = piece_of == piece
         median = float(height[inside].median())
-        if _is_round(place[inside], height[inside]) or (level is not None and abs(median - level) > BESIDE):
+        bad = _is_narrow(place[inside]) or _is_round(place[inside], height[inside])
+        if bad or (level is not None and abs(median - level) > BESIDE):
             gone.append(piece)
         elif level is None:
             level = median
     return torch.tensor(gone, dtype=piece_of.dtype)
+
+
+def _is_narrow(place: Tensor) -> bool:
+    """Whether Gaussians at `place` `[n, 2]` [m] stand in a strip: most of them within `NARROW` of its middle."""
+    return bool(((place - place.median(0).values).abs().quantile(0.8, 0) < NARROW).any())
 
 
 def _is_round(place: Tensor, height: Tensor) -> bool:
@@ -220,6 +228,31 @@ def outlined(planes: Planes, patches: Patches, obstacles: Obstacles) -> Patches:
         for _ in range(OUTSIDE):
             kept = kept & ~(spilled & rim(closed(kept)))
         points.append(middles[kept[patches.grid(plane)]])
+    return Patches.of(planes, points, patches.cell)
+
+
+def standing(planes: Planes, patches: Patches) -> Patches:
+    """The patches with small planes down to the floor, or up to any large plane that they nearly reach.
+
+    In the edge between two surfaces photographs show neither well, and echoes are of both; what ends `FOOT` before a
+    large plane's surface mostly stands on it. A board and the floor mirror together right there.
+    """
+    points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
+    grounds = torch.nonzero(patches.areas >= LARGE).squeeze(-1).tolist()
+    steps = torch.arange(patches.cell, 1.5 * FOOT, patches.cell)
+    for plane in torch.nonzero(patches.areas < LARGE).squeeze(-1).tolist():
+        cells, normal = points[plane], planes.normals[plane]
+        for ground in grounds:
+            slope = planes.normals[ground] - (planes.normals[ground] @ normal) * normal
+            if not len(cells) or float(slope @ slope) < STEEP:
+                continue
+            height = cells @ planes.normals[ground] - planes.offsets[ground]
+            near = torch.nonzero(height.abs() < FOOT).squeeze(-1)
+            near = near[patches.holds(cells[near], torch.full_like(near, ground))]
+            way = height[near] / (slope @ slope)
+            along = steps[:, None] * way.sign() * slope.norm().reciprocal()
+            added = cells[near] - along[..., None] * slope
+            points[plane] = torch.cat((points[plane], added[along.abs() < way.abs()]))
     return Patches.of(planes, points, patches.cell)
 
 
@@ -279,6 +312,11 @@ def squared(surfaces: Surfaces) -> Surfaces:
     ]
     plane_of = torch.where(surfaces.plane_of >= 0, whole[surfaces.plane_of.clamp_min(0)], -1)
     return replace(surfaces, planes=planes, patches=Patches.of(planes, flat, patches.cell), plane_of=plane_of)
+
+
+def large_normals(surfaces: Surfaces) -> Tensor:
+    """Normals `[wall, 3]` of the large planes, along which most of what people build stands."""
+    return surfaces.planes.normals[surfaces.patches.areas >= LARGE]
 
 
 def oblique_planes(planes: Planes, patches: Patches) -> Tensor:

@@ -22,6 +22,7 @@ from rf3dgs.training.echo_planes import (
     LEAST_WITNESSES,
     REGION,
     behind,
+    bounding,
     cells_of,
     filled,
     in_free_space,
@@ -69,7 +70,7 @@ def geometry_of_echoes(echoes: Echoes, *, seed: int = 0) -> Gaussians:
     planes, patches = _planes_of(echoes, spots, seed)
     if not len(planes):
         raise InputError(f"{len(echoes)} echoes lie on no common plane; give spectra at more positions, or finer ones")
-    return _with_planes(planes, patches, spots)
+    return _with_planes(planes, patches, spots, echoes)
 
 
 def _planes_of(echoes: Echoes, spots: Spots, seed: int) -> tuple[Planes, Patches]:
@@ -107,7 +108,7 @@ def corrected(geometry: Gaussians, spectra: Spectrum, tx: Pose | None = None, *,
     loose = ~torch.cat((trusted, trusted.new_zeros(1)))[surfaces.plane_of]  # -1, off the planes, is the last one
     haze = loose & (in_free_space(moved.means, echoes) | behind(moved.means, walls, extents, echoes))
     kept = Gaussians(**{name: part[~haze] for name, part in moved.tensors().items()})
-    return completed_by(kept, _with_planes(walls, extents, spots))
+    return completed_by(kept, _with_planes(walls, extents, spots, echoes))
 
 
 def _chosen(first: Planes, other: Planes, chosen: Tensor) -> Planes:
@@ -156,11 +157,17 @@ def _transmitter(spectra: Spectrum, tx: Pose | None) -> Pose:
     return estimate_transmitter(spectra) if where is None else where
 
 
-def _with_planes(planes: Planes, patches: Patches, spots: Spots) -> Gaussians:
-    """Gaussians in every cell of the planes, and on spots off the planes that several views saw."""
+def _with_planes(planes: Planes, patches: Patches, spots: Spots, echoes: Echoes) -> Gaussians:
+    """Gaussians in every cell of the planes, and on spots off the planes that several views saw.
+
+    But for the planes that bound the site, nothing stands where waves were seen to cross.
+    """
     cells, plane = cells_of(planes, patches)
-    walls = _flat(cells, planes.normals[plane], patches.cell)
+    bounds = torch.tensor(bounding(planes, patches, echoes), dtype=torch.long)
+    held = torch.isin(plane, bounds) | ~in_free_space(cells, echoes)
+    walls = _flat(cells[held], planes.normals[plane[held]], patches.cell)
     off = (owner_of(planes, patches, spots.points, ON_PLANE) < 0) & (spots.views >= LEAST_VIEWS)
+    off &= ~in_free_space(spots.points, echoes)
     return Gaussians.join((walls, _flat(spots.points[off], spots.normals[off], SPOT)))
 
 

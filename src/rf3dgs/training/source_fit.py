@@ -19,9 +19,11 @@ from rf3dgs.training.config import SourceConfig
 from rf3dgs.training.consolidation import (
     consolidated,
     flat_pieces,
+    large_normals,
     oblique_planes,
     outlined,
     squared,
+    standing,
     with_both_faces,
     with_skins,
 )
@@ -33,7 +35,7 @@ from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, re
 
 PROBES = 150
 PROBE_MARGIN = 0.5
-GATES = (0.5, 0.4, 0.3, 0.2, 0.1, 0.05)  # of transmittance
+GATES = (0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05)  # of transmittance
 USUAL, USUAL_OF_MESHES = 0.4, 0.1  # what passes beside outlines
 OF_MESHES = 0.9  # of the Gaussians of a mesh have one and the same opacity
 WORTH_A_CHANGE = 0.01  # share of what was looked at that another threshold must tell better
@@ -81,13 +83,13 @@ def fit_sources(
     direct, seen = fit_line_of_sight(direct, spectra)
     direct = fit_opening(direct, seen, positions, obstacles)
     if surfaces is None or config.order == 0 or not len(surfaces.planes):
-        obstacles = replace(obstacles, labels=None).cleared(tx.position.expand_as(positions[seen]), positions[seen])
+        obstacles = replace(obstacles, labels=None).cleared(tx.position.expand_as(positions), positions, seen)
         return SourceFit(direct, seen, direct.rays_each(positions, obstacles, in_sight=seen), obstacles)
     probes = torch.cat((positions, _probes(positions, config.seed)))
     surfaces = with_both_faces(consolidated(surfaces, obstacles.means), obstacles)
     obstacles = replace(obstacles, labels=surfaces.plane_of)
     sources = _known(direct, surfaces)
-    timed = timed_mirrors(spectra, tx.position) if config.complete else []
+    timed = timed_mirrors(spectra, tx.position, large_normals(surfaces)) if config.complete else []
     if timed:
         sources, surfaces, obstacles = _over(sources, with_timed(sources, timed), surfaces, obstacles)
     if config.square:
@@ -108,7 +110,8 @@ def fit_sources(
             sources = with_images(sources, probes, replace(config, order=1))
             sources = _refined(sources, seen, peaks, positions, obstacles, config)
     assert sources.patches is not None
-    sources = replace(sources, patches=outlined(sources.planes, sources.patches, obstacles))
+    outlines = outlined(sources.planes, sources.patches, obstacles)
+    sources = replace(sources, patches=standing(sources.planes, outlines))
     sources = _gated(sources, spectra, seen, obstacles)
     obstacles = cleared_by(sources, spectra, seen, obstacles)
     rays = sources.rays_each(positions, obstacles, in_sight=seen)
@@ -172,20 +175,21 @@ def _fitted(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: O
 
 
 def cleared_by(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Obstacles) -> Obstacles:
-    """The obstacles without what stands in ways that the spectra show to be open: lines of sight and single mirrors."""
+    """The obstacles without what stands in ways that the spectra show to be open, lines of sight and single mirrors,
+    unless ways that they show to be closed need it.
+    """
     positions = spectra.pose.position
     ways = [sources.candidates(position, obstacles)[0] for position in positions]
     looked = glints(sources, ways, spectra)
-    shone = looked.seen & looked.alone
-    receiver, mirror, plane = positions[looked.position[shone]], looked.point[shone, 0], looked.plane[shone, 0]
-    nothing = torch.full_like(plane, -1)
-    straight = positions[seen]
-    free = torch.full((len(straight),), -1)
+    looked = looked.only(looked.alone & (looked.order == 1))
+    receiver, mirror, plane = positions[looked.position], looked.point[:, 0], looked.plane[:, 0]
+    nothing, straight = torch.full_like(plane, -1), torch.full((len(positions),), -1)
     return obstacles.cleared(
-        torch.cat((sources.tx.expand_as(mirror), mirror, sources.tx.expand_as(straight))),
-        torch.cat((mirror, receiver, straight)),
-        skip_start=torch.cat((nothing, plane, free)),
-        skip_end=torch.cat((plane, nothing, free)),
+        torch.cat((sources.tx.expand_as(mirror), mirror, sources.tx.expand_as(positions))),
+        torch.cat((mirror, receiver, positions)),
+        torch.cat((looked.seen, looked.seen, seen)),
+        skip_start=torch.cat((nothing, plane, straight)),
+        skip_end=torch.cat((plane, nothing, straight)),
     )
 
 

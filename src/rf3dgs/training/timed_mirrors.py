@@ -32,12 +32,14 @@ SAME_ANGLE, SAME_DISTANCE = math.cos(math.radians(10.0)), 0.5
 ROUNDS = 5
 
 
-def timed_mirrors(spectra: Spectrum, tx: Tensor) -> list[Mirror]:
+def timed_mirrors(spectra: Spectrum, tx: Tensor, walls: Tensor) -> list[Mirror]:
     """The mirrors that peaks of `spectra` `[position, row, col]` tell of a transmitter at `tx` `[3]`, those that most
     positions see first; none where spectra have no delay or departure.
 
     An image counts that four positions see within 30 cm of one place, unless two or three reflections in the mirrors
-    that more positions see put one there, too: three in floor and ceiling leave the transmitter as one does.
+    that more positions see put one there, too: three in floor and ceiling leave the transmitter as one does. Nor does
+    it if one of those mirrors has it from where a board along one of the `walls` `[wall, 3]`, unit normals, would put
+    it: what a board and the floor reflect seems to come from one tilted mirror over the edge between both.
     """
     position, image = _images(spectra, tx)
     receivers, mirrors = spectra.pose.position, []
@@ -54,7 +56,8 @@ def timed_mirrors(spectra: Spectrum, tx: Tensor) -> list[Mirror]:
         normal, offset = _bisector(tx, middle)
         origin = receivers[position[chosen]]
         points, ahead = _crossing(origin, middle, tx, normal, offset)
-        if bool(ahead.any()) and not _is_image_of_image(middle, tx, mirrors):
+        twice = _is_image_of_image(middle, tx, mirrors) or _is_image_of_board(middle, tx, mirrors, walls)
+        if bool(ahead.any()) and not twice:
             mirrors.append(Mirror(normal, offset, points[ahead], middle, origin[ahead]))
         position, image = position[~(chosen | near[best])], image[~(chosen | near[best])]
     return mirrors
@@ -103,6 +106,20 @@ def _is_image_of_image(image: Tensor, tx: Tensor, mirrors: list[Mirror]) -> bool
     normals, offsets = (torch.stack([getattr(one, name) for one in mirrors]) for name in ("normal", "offset"))
     apart = image_chain(tx, normals, offsets, rows)[:, -1] - image
     return bool((torch.linalg.vector_norm(apart, dim=-1) < 2 * SAME_IMAGE).any())
+
+
+def _is_image_of_board(image: Tensor, tx: Tensor, mirrors: list[Mirror], walls: Tensor) -> bool:
+    """Whether one of the `mirrors` has `image` `[3]` from the transmitter's in a board along one of the `walls`."""
+    if _off_axis(tx - image, walls) < SAME_IMAGE:
+        return False
+    before = [image + 2 * (one.offset - one.normal @ image) * one.normal for one in mirrors]
+    return any(_off_axis(tx - place, walls) < 2 * SAME_IMAGE for place in before)
+
+
+def _off_axis(way: Tensor, axes: Tensor) -> float:
+    """How far the end of a `way` `[3]` lies off the nearest of the `axes` `[axis, 3]` through its start [m]."""
+    aside = way - (axes @ way)[:, None] * axes
+    return min(torch.linalg.vector_norm(aside, dim=-1).tolist(), default=math.inf)
 
 
 def _images(spectra: Spectrum, tx: Tensor) -> tuple[Tensor, Tensor]:
