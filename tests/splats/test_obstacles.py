@@ -289,7 +289,7 @@ def test_a_segment_that_is_known_to_be_free_is_cleared(seed: int) -> None:
 
 
 def test_what_closed_segments_need_is_not_cleared() -> None:
-    """A thin thing in a free segment goes; a wall that stops two closed ones stays, though one free segment meets it."""
+    """A thing in a free segment goes; a wall that stops two closed ones stays, though a free segment meets it."""
     cloud = plate(2.0)  # across the x axis
     wall, count = obstacles_of(cloud), len(cloud.means)
     thing = Obstacles(*(torch.cat((part, part[:1])) for part in (wall.means, wall.quats, wall.scales, wall.opacities)))

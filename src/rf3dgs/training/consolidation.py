@@ -239,7 +239,7 @@ def standing(planes: Planes, patches: Patches) -> Patches:
     """
     points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
     grounds = torch.nonzero(patches.areas >= LARGE).squeeze(-1).tolist()
-    steps = torch.arange(patches.cell, 1.5 * FOOT, patches.cell)
+    steps = torch.arange(0.0, 1.5 * FOOT, patches.cell)
     for plane in torch.nonzero(patches.areas < LARGE).squeeze(-1).tolist():
         cells, normal = points[plane], planes.normals[plane]
         for ground in grounds:

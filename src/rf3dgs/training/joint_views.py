@@ -54,7 +54,7 @@ def joint_views(
 def _view(surface: LitSurface, one: Spectrum, rays: Rays, floor_db: float, backend: Backend) -> JointView:
     unit, view = surface.unit, view_of(one.pose, one.grid)
     floor = torch.zeros_like(one.power) if one.floor is None else torch.where(one.looked, one.floor, torch.zeros(()))
-    told = one.looked & ((one.power > 0) | (floor > 0))
+    told = one.looked
     truth = (one.power / unit)[..., None]
     known = torch.ones(len(rays), 1)
     if one.delay is not None and one.aod is not None:

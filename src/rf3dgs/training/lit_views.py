@@ -32,10 +32,10 @@ SOFT_NS, SOFT_TURN = 1.0, 0.1  # errors of delay [ns] and departure [rad] that c
 class LitView:
     """One training spectrum without its point sources.
 
-    view: what it shows. keep `[row, col]`: solid angle of the pixel relative to the picture's mean, zero where point
-    sources bring more than 30 % of the power or there is none. channels `[row, col, 1 (+ 4)]`: the rest of the power,
-    linear, and that times delay [ns] and departure where the spectra have them. floor `[row, col]`: power up to which
-    it says no more than "at most that"; zero where the spectra have none.
+    view: what it shows. keep `[row, col]`: solid angle of the pixel relative to the picture's mean, zero where it says
+    nothing of the surface, because point sources bring more than 30 % of the power. channels `[row, col, 1 (+ 4)]`: the
+    rest of the power, linear, and that times delay [ns] and departure where the spectra have them. floor `[row, col]`:
+    power up to which it says no more than "at most that"; zero where the spectra have none.
     """
 
     view: View
@@ -100,15 +100,16 @@ def _view(one: Spectrum, rays: Rays | None) -> LitView:
     if one.delay is not None and one.aod is not None:
         channels = torch.cat((power, power * one.delay.double()[..., None] / NANOSECOND, power * one.aod.double()), -1)
     keep = area.clone()
+    dark = one.power <= 0  # which says that no surface shines there
     if rays is not None and len(rays):
-        keep = area * ~ruled(one, rays)[1]
+        keep = area * (~ruled(one, rays)[1] | dark)
         place, ray, share = rays.shares(one.pose, one.grid, one.instrument)
         known = torch.cat((torch.ones(len(rays), 1), rays.delay[:, None] / NANOSECOND, rays.departure), -1)
         taken = (share[:, None] * known[ray])[:, : channels.shape[-1]].double()
         flat = channels.reshape(-1, channels.shape[-1]).index_add(0, place, -taken)
         channels = flat.reshape(channels.shape)
     floor = torch.zeros_like(one.power) if one.floor is None else torch.where(one.looked, one.floor, torch.zeros(()))
-    told = one.looked & ((channels[..., 0] > 0) | (floor > 0))
+    told = one.looked & ((channels[..., 0] > 0) | (floor > 0) | dark)
     return LitView(view_of(one.pose, one.grid), keep * told, channels, floor)
 
 

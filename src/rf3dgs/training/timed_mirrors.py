@@ -21,7 +21,7 @@ from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.training.consolidation import surface_points
 from rf3dgs.training.line_of_sight import standing_out
-from rf3dgs.training.virtual import NEAREST_IMAGE, PEAKS, Mirror, discs
+from rf3dgs.training.virtual import DISC, NEAREST_IMAGE, PEAKS, Mirror, discs
 
 STANDS_OUT = 4.0  # over the surroundings: a peak's delay is then nearly its own
 DEPARTURE = math.radians(2.0)
@@ -29,6 +29,9 @@ SAME_IMAGE = 0.3  # m
 LEAST_POSITIONS = 4
 MOST_FOUND = 20
 SAME_ANGLE, SAME_DISTANCE = math.cos(math.radians(10.0)), 0.5
+BESIDE_AXIS = 0.1  # m
+SEEN_ANGLE, SEEN_DISTANCE, BESIDE = math.cos(math.radians(15.0)), 0.15, 0.5  # of mirrors that few positions saw
+FEW_DISC = (0.2, 0.2)  # m of surface around their reflections where there is no plane
 ROUNDS = 5
 
 
@@ -39,56 +42,85 @@ def timed_mirrors(spectra: Spectrum, tx: Tensor, walls: Tensor) -> list[Mirror]:
     An image counts that four positions see within 30 cm of one place, unless two or three reflections in the mirrors
     that more positions see put one there, too: three in floor and ceiling leave the transmitter as one does. Nor does
     it if one of those mirrors has it from where a board along one of the `walls` `[wall, 3]`, unit normals, would put
-    it: what a board and the floor reflect seems to come from one tilted mirror over the edge between both.
+    it: what a board and the floor reflect seems to come from one tilted mirror over the edge between both. Of mirrors
+    along walls, and inside the site, one position is witness enough: nothing else puts an image 10 cm beside an axis.
     """
     position, image = _images(spectra, tx)
     receivers, mirrors = spectra.pose.position, []
     while len(mirrors) < MOST_FOUND and len(position):
-        near = torch.cdist(image, image) < SAME_IMAGE
-        seen_by = torch.zeros(len(image), len(receivers)).index_add_(1, position, near.float()) > 0
-        best = int(seen_by.sum(-1).argmax())
-        if int(seen_by[best].sum()) < LEAST_POSITIONS:
+        mirror, near = _best(position, image, receivers, tx)
+        if int(position[near].unique().numel()) < LEAST_POSITIONS:
             break
-        chosen, middle = near[best], image[best]
-        for _ in range(ROUNDS):
-            middle = image[chosen].median(0).values
-            chosen = torch.linalg.vector_norm(image - middle, dim=-1) < SAME_IMAGE
-        normal, offset = _bisector(tx, middle)
-        origin = receivers[position[chosen]]
-        points, ahead = _crossing(origin, middle, tx, normal, offset)
-        twice = _is_image_of_image(middle, tx, mirrors) or _is_image_of_board(middle, tx, mirrors, walls)
-        if bool(ahead.any()) and not twice:
-            mirrors.append(Mirror(normal, offset, points[ahead], middle, origin[ahead]))
-        position, image = position[~(chosen | near[best])], image[~(chosen | near[best])]
-    return mirrors
+        twice = _is_image_of_image(mirror.image, tx, mirrors) or _is_image_of_board(mirror.image, tx, mirrors, walls)
+        if len(mirror.points) and not twice:
+            mirrors.append(mirror)
+        position, image = position[~near], image[~near]
+    bounds = [one for one in mirrors if bool((receivers @ one.normal > one.offset).all())]
+    seldom: list[Mirror] = []
+    while len(seldom) < MOST_FOUND and len(position):
+        mirror, near = _best(position, image, receivers, tx)
+        inside = all(bool((mirror.points @ one.normal > one.offset).all()) for one in bounds)
+        along = _off_axis(tx - mirror.image, walls) < BESIDE_AXIS
+        if len(mirror.points) and inside and along and not _is_image_of_image(mirror.image, tx, mirrors):
+            seldom.append(mirror)
+        position, image = position[~near], image[~near]
+    return mirrors + seldom
+
+
+def _best(position: Tensor, image: Tensor, receivers: Tensor, tx: Tensor) -> tuple[Mirror, Tensor]:
+    """The mirror of the image that most positions see, and which of the images `[n]` are it."""
+    near = torch.cdist(image, image) < SAME_IMAGE
+    seen_by = torch.zeros(len(image), len(receivers)).index_add_(1, position, near.float()) > 0
+    best = int(seen_by.sum(-1).argmax())
+    chosen, middle = near[best], image[best]
+    for _ in range(ROUNDS):
+        middle = image[chosen].median(0).values
+        chosen = torch.linalg.vector_norm(image - middle, dim=-1) < SAME_IMAGE
+    normal, offset = _bisector(tx, middle)
+    origin = receivers[position[chosen]]
+    points, ahead = _crossing(origin, middle, tx, normal, offset)
+    return Mirror(normal, offset, points[ahead], middle, origin[ahead]), chosen | near[best]
 
 
 def with_timed(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, Patches]:
     """Planes and patches put right by mirrors.
 
     A plane within 10 degrees and 50 cm of a mirror, at the places where that was seen to reflect, is moved into it and
-    has surface there, the largest such plane alone; a mirror without one is a new plane.
+    has surface there, the largest such plane alone; a mirror without one is a new plane. Of a mirror that few positions
+    saw it is the plane with most surface within 50 cm of those places, within 15 degrees and 15 cm.
     """
     assert sources.patches is not None
     normals, offsets = list(sources.planes.normals), list(sources.planes.offsets)
     points = [surface_points(sources.planes, sources.patches, plane) for plane in range(len(sources.planes))]
-    largest = sources.patches.areas.argsort(descending=True, stable=True).tolist()
+    areas = sources.patches.areas
     taken: set[int] = set()
     for mirror in mirrors:
         middle = mirror.points.median(0).values
-        for plane in largest:
-            same = abs(float(normals[plane] @ mirror.normal)) > SAME_ANGLE and plane not in taken
-            if same and abs(float(normals[plane] @ middle - offsets[plane])) < SAME_DISTANCE:
-                side = float((normals[plane] @ mirror.normal).sign())
-                normals[plane], offsets[plane] = side * mirror.normal, side * mirror.offset
-                break
+        few = len(mirror.points) < LEAST_POSITIONS
+        angle, distance = (SEEN_ANGLE, SEEN_DISTANCE) if few else (SAME_ANGLE, SAME_DISTANCE)
+        surface = (
+            [float((torch.cdist(part, middle[None]) < BESIDE).sum()) for part in points] if few else areas.tolist()
+        )
+        alike = [
+            plane
+            for plane in range(len(areas))
+            if plane not in taken
+            and abs(float(normals[plane] @ mirror.normal)) > angle
+            and abs(float(normals[plane] @ middle - offsets[plane])) < distance
+            and surface[plane] > 0
+        ]
+        plane = max(alike, key=surface.__getitem__, default=len(points))
+        if alike:
+            side = float((normals[plane] @ mirror.normal).sign())
+            normals[plane], offsets[plane] = side * mirror.normal, side * mirror.offset
         else:
-            plane = len(points)
             normals.append(mirror.normal)
             offsets.append(mirror.offset)
             points.append(torch.zeros(0, 3))
         taken.add(plane)
-        points[plane] = torch.cat((points[plane], discs(mirror, sources.patches, plane)))
+        points[plane] = torch.cat(
+            (points[plane], discs(mirror, sources.patches, plane, FEW_DISC if few and not alike else DISC))
+        )
     planes = Planes(torch.stack(normals), torch.stack(offsets))
     flat = [
         part - (part @ n - o)[:, None] * n for part, n, o in zip(points, planes.normals, planes.offsets, strict=True)

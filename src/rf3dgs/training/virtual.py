@@ -260,10 +260,11 @@ def with_mirrors(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, 
     return planes, Patches.of(planes, points, sources.patches.cell)
 
 
-def discs(mirror: Mirror, patches: Patches, plane: int) -> Tensor:
+def discs(mirror: Mirror, patches: Patches, plane: int, reaches: tuple[float, float] = DISC) -> Tensor:
     """Points `[n, 3]`, a cell apart, all over discs of surface around where a mirror was seen to reflect.
 
-    Discs reach as far as the third nearest such place, so that sparse observations still close to one surface. Where
+    Discs reach as far as the third nearest such place, so that sparse observations still close to one surface, but not
+    less or more than `reaches` [m]. Where
     the `plane`, if it is one of the `patches`, has surface already there is none: its outline stays.
     """
     missing = torch.ones(len(mirror.points), dtype=torch.bool)
@@ -273,8 +274,8 @@ def discs(mirror: Mirror, patches: Patches, plane: int) -> Tensor:
     lean = lean / torch.linalg.vector_norm(lean)
     axes = torch.stack((lean, torch.linalg.cross(mirror.normal, lean)))
     apart = torch.cdist(mirror.points, mirror.points).sort(-1).values
-    reach = apart[:, min(3, len(apart) - 1)].clamp(*DISC)
-    cells = round(DISC[1] / patches.cell)
+    reach = apart[:, min(3, len(apart) - 1)].clamp(*reaches)
+    cells = round(reaches[1] / patches.cell)
     steps = torch.arange(-cells, cells + 1.0) * patches.cell
     spots = torch.cartesian_prod(steps, steps)
     inside = (spots.norm(dim=-1) <= reach[:, None]) & missing[:, None]
