@@ -222,6 +222,24 @@ def test_geometry_from_spectra_covers_every_wall(from_radio):
     assert float((normals(from_radio).abs().amax(-1) > 0.99).double().mean()) > 0.97
 
 
+def test_nothing_stands_where_waves_went_through():
+    """A dozen echoes that lie about one place in mid-room, seen from three receivers, make nothing there."""
+    echoes = echoes_of(single(), TX)
+    stray = torch.tensor([3.0, 2.5, 1.6]) + 0.02 * torch.randn(12, 3, generator=torch.Generator().manual_seed(3))
+    told = replace(
+        echoes,
+        points=torch.cat((echoes.points, stray)),
+        view=torch.cat((echoes.view, torch.arange(12) % 3)),
+        error=torch.cat((echoes.error, torch.full((12,), 0.02))),
+    )
+    spots = merged(told, 0.12)
+    beside = torch.cdist(spots.points, stray.mean(0, keepdim=True)).squeeze(-1) < 0.1
+    assert int(spots.views[beside].max()) == 3
+    made = radio_geometry.geometry_of_echoes(told)
+    assert float(torch.cdist(made.means, stray).min()) > 0.3
+    assert float(off_the_walls(made.means).max()) < 0.1
+
+
 def test_geometry_from_spectra_finds_the_transmitter_when_it_is_not_told(from_radio):
     spectra = single(astray_deg=0.3)
     straight = TX - spectra.pose.position

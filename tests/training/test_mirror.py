@@ -184,6 +184,28 @@ def test_pixels_that_a_point_source_rules_do_not_count(training, field):
     assert float((found.keep[~lamp] > 0).float().mean()) > 0.95
 
 
+def test_pixels_without_power_say_that_no_surface_shines_there(training, field):
+    """However weak it is, the skirt of a point source is all of the power of a pixel that has none."""
+    dark = torch.zeros(training.grid.shape, dtype=torch.bool)
+    dark[:, 40:50] = True
+    some = replace(training[:1], power=training.power[:1] * ~dark)
+    rays = [field.sources.rays(training.pose.position[0], field.obstacles)]
+    found = lit_views(some, rays)[0]
+    assert float(found.keep[dark].min()) > 0.0
+    assert not bool((found.certain > 0)[dark].any())
+
+
+def test_what_is_dark_for_every_receiver_is_shown_dark(training, field):
+    """Half of the room's pictures without power: the field follows by what its residual may do, 12 dB."""
+    half = torch.arange(training.grid.height)[:, None] < training.grid.height // 2
+    dark = replace(training, power=torch.where(half, 0.0, training.power))
+    shown = fit_radio(room(), dark, replace(MIRROR, mirror_order=0)).render(training.pose[0], training.grid).power
+    usual = field.render(training.pose[0], training.grid).power
+    above = half & away_from_the_lamp(training[:1])[0] & (usual > 0)
+    fallen_db = 10 * torch.log10(usual[above] / shown[above].clamp_min(1e-30))
+    assert float(fallen_db.median()) > 8.0
+
+
 def test_lists_of_directions_are_refused(training):
     grid = list_grid(
         torch.nn.functional.normalize(torch.randn(8, 3, generator=torch.Generator().manual_seed(0)), dim=-1)

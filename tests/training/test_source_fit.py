@@ -30,6 +30,7 @@ from rf3dgs.training.consolidation import (
     oblique_planes,
     outlined,
     squared,
+    standing,
     surface_points,
     with_both_faces,
 )
@@ -173,17 +174,71 @@ def test_delay_and_departure_of_single_peaks_tell_the_walls(spectra):
     assert timed_mirrors(replace(spectra, delay=None, aod=None), TX, walls().planes.normals) == []
 
 
+def showing(pose: Pose, images: list[torch.Tensor], *, often: list[int] | None = None) -> Spectrum:
+    """What `pose` measures of the room if it shows the transmitter and these `images` [m] alone, each at the first so
+    many positions as `often` says."""
+    paths = traced(pose)
+    place = pose.position[:, None] + SPEED_OF_LIGHT * paths.delay[..., None] * paths.aoa
+    near = torch.cdist(place, torch.stack((TX, *images))) < 0.01
+    limit = torch.tensor([len(pose), *(often or [len(pose)] * len(images))])
+    kept = (near & (torch.arange(len(pose))[:, None, None] < limit)).any(-1)
+    seen = replace(paths, coeff=torch.where(kept, paths.coeff, 0.0))
+    return spectrum_of(seen, None, equirect_grid(180, 90), lobe=math.radians(4.0))
+
+
+FLOORED, BOTH = TX * torch.tensor([1.0, 1.0, -1.0]), torch.tensor([2 * SIZE[0] - TX[0], TX[1], -TX[2]])
+EASTERN = BOTH * torch.tensor([1.0, 1.0, -1.0])
+
+
+def test_one_position_is_witness_of_a_mirror_along_a_wall():
+    """The east wall shines at one of forty. Without walls that it could stand along nothing is made of that."""
+    shown = showing(receivers(40, 0), [FLOORED, EASTERN], often=[40, 1])
+    floor, board = timed_mirrors(shown, TX, walls().planes.normals)
+    assert len(floor.points) > 10
+    assert len(board.points) == 1
+    assert float(board.normal[0]) < -math.cos(math.radians(0.5))
+    assert float(-board.offset) == pytest.approx(float(SIZE[0]), abs=0.03)
+    assert len(timed_mirrors(shown, TX, torch.zeros(0, 3))) == 1
+
+
+def test_an_image_behind_what_bounds_the_site_is_no_mirror():
+    """Two reflections in two far walls may look like one; its mirror would stand behind the wall itself."""
+    opposite = torch.tensor([-2 * SIZE[0] + TX[0], TX[1], TX[2]])  # in the east wall and then in the western one
+    western = TX * torch.tensor([-1.0, 1.0, 1.0])
+    shown = showing(receivers(40, 0), [western, opposite], often=[40, 3])
+    (known,) = timed_mirrors(shown, TX, walls().planes.normals)
+    assert float(known.normal[0]) > math.cos(math.radians(0.5))
+
+
+def test_a_mirror_that_one_position_saw_moves_what_stands_there():
+    """Of two faces in nearly one plane that beside the reflection is moved; where nothing stands one is new."""
+    planes = Planes(torch.tensor([[0.0, -1.0, 0.0], [0.2, -0.98, 0.0]]), torch.tensor([-4.05, -3.2]))
+    axis = torch.arange(0.05, 0.6, 0.1)
+    cells = torch.cartesian_prod(axis, torch.zeros(1), torch.arange(0.05, 3.0, 0.1))
+    normal = torch.nn.functional.normalize(planes.normals[1], dim=0)
+    planes = Planes(torch.stack((planes.normals[0], normal)), torch.stack((planes.offsets[0], normal[0] * 4.5 - 4.05)))
+    far = cells + torch.tensor([9.0, 4.05, 0.0])
+    near = cells + torch.tensor([4.2, 0.0, 0.0])
+    near = near + ((planes.offsets[1] - near @ normal) / normal[1])[:, None] * torch.tensor([0.0, 1.0, 0.0])
+    sources = PointSources(TX, FREQUENCY, planes, Patches.of(planes, [far, near]), sequences(2, 1), torch.zeros(2, 3))
+
+    def put_right(x: float) -> Planes:
+        spot = torch.tensor([[x, 4.1, 1.5]])
+        image = TX * torch.tensor([1.0, -1.0, 1.0]) + torch.tensor([0.0, 8.2, 0.0])
+        mirror = Mirror(torch.tensor([0.0, -1.0, 0.0]), torch.tensor(-4.1), spot, image, torch.zeros(1, 3))
+        return with_timed(sources, [mirror])[0]
+
+    moved = put_right(4.5)
+    assert moved.normals[1].tolist() == pytest.approx([0.0, -1.0, 0.0], abs=1e-6)
+    assert moved.offsets.tolist() == pytest.approx([-4.05, -4.1])
+    added = put_right(7.0)
+    assert torch.equal(added.normals[:2], planes.normals)
+    assert added.offsets[2:].tolist() == pytest.approx([-4.1])
+
+
 def test_what_a_board_and_the_floor_reflect_is_no_tilted_mirror():
     """Of the east wall only its reflections over the floor are seen: one mirror through the edge would do the same."""
-    pose, paths = receivers(40, 0), traced(receivers(40, 0))
-    floored, both = TX * torch.tensor([1.0, 1.0, -1.0]), torch.tensor([2 * SIZE[0] - TX[0], TX[1], -TX[2]])
-    place = pose.position[:, None] + SPEED_OF_LIGHT * paths.delay[..., None] * paths.aoa
-    kept = (torch.cdist(place, torch.stack((TX, floored, both))) < 0.01).any(-1)
-    shown = spectrum_of(
-        replace(paths, coeff=torch.where(kept, paths.coeff, 0.0)),
-        *(None, equirect_grid(180, 90)),
-        lobe=math.radians(4.0),
-    )
+    shown = showing(receivers(40, 0), [FLOORED, BOTH])
     floor = torch.tensor([0.0, 0.0, 1.0])
     (known,) = timed_mirrors(shown, TX, walls().planes.normals)
     assert float(known.normal @ floor) > math.cos(math.radians(0.5))
@@ -536,6 +591,39 @@ def test_round_pieces_and_pieces_of_other_things_are_no_part_of_a_mirror():
     assert bool((flat.plane_of.reshape(4, 400) == torch.tensor([[0], [-1], [-1], [0]])).all())
     y = surface_points(flat.planes, flat.patches, 0)[:, 1]
     assert bool((((y > -0.1) & (y < 1.1)) | ((y > 4.9) & (y < 5.6))).all())
+
+
+def test_a_strip_narrower_than_a_column_is_no_mirror():
+    """Of a round column that was drawn flat a strip of 30 cm is left; a board of 50 cm beside it stays."""
+    strip, board = sheet(4.0, 0.0, 0.3), sheet(4.0, 1.0, 1.5, seed=1)
+    surfaces, obstacles = things((strip, 0), (board, 0))
+    flat = flat_pieces(surfaces, obstacles)
+    assert bool((flat.plane_of.reshape(2, 400) == torch.tensor([[-1], [0]])).all())
+    assert float(surface_points(flat.planes, flat.patches, 0)[:, 1].min()) > 0.9
+
+
+@pytest.mark.parametrize(("gap", "stands"), [(0.0, True), (0.2, True), (0.6, False)])
+def test_a_board_that_ends_close_to_the_floor_stands_on_it(gap, stands):
+    planes = Planes(torch.tensor([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), torch.tensor([0.0, -2.0]))
+    floor = torch.cartesian_prod(torch.arange(0.05, 4.0, 0.1), torch.arange(0.05, 4.0, 0.1), torch.zeros(1))
+    board = torch.cartesian_prod(
+        torch.arange(1.05, 2.0, 0.1), torch.full((1,), 2.0), torch.arange(gap + 0.05, 1.8, 0.1)
+    )
+    found = standing(planes, Patches.of(planes, [floor, board]))
+    foot, top = torch.tensor([[1.5, 2.0, 0.02], [1.5, 2.0, 1.6]]).unbind()
+    assert bool(found.holds(foot, torch.tensor(1))) == stands
+    assert bool(found.holds(top, torch.tensor(1)))
+    assert float(surface_points(planes, found, 1)[:, 2].min()) > -0.06
+    assert float(found.areas[1]) == pytest.approx(1.8 - (0 if stands else gap), abs=0.11)
+    assert float(found.areas[0]) == pytest.approx(16.0, rel=0.01)
+
+
+def test_wide_cells_of_a_board_stay_as_they_are():
+    """Streets have cells of metres, which reach the ground by themselves."""
+    planes = Planes(torch.tensor([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), torch.tensor([0.0, -2.0]))
+    spots = [torch.tensor([[1.0, 1.0, 0.0], [3.0, 1.0, 0.0], [1.0, 3.0, 0.0]]), torch.tensor([[1.0, 2.0, 0.2]])]
+    patches = Patches.of(planes, spots, 2.0)
+    assert standing(planes, patches).areas.tolist() == pytest.approx(patches.areas.tolist())
 
 
 def test_marks_are_left_out_where_planes_are_uniform(fitted):
