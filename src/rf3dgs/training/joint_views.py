@@ -54,7 +54,6 @@ def joint_views(
 def _view(surface: LitSurface, one: Spectrum, rays: Rays, floor_db: float, backend: Backend) -> JointView:
     unit, view = surface.unit, view_of(one.pose, one.grid)
     floor = torch.zeros_like(one.power) if one.floor is None else torch.where(one.looked, one.floor, torch.zeros(()))
-    told = one.looked
     truth = (one.power / unit)[..., None]
     known = torch.ones(len(rays), 1)
     if one.delay is not None and one.aod is not None:
@@ -65,7 +64,7 @@ def _view(surface: LitSurface, one: Spectrum, rays: Rays, floor_db: float, backe
     return JointView(
         view=view,
         hit=surface.hit_in(view, backend),
-        worth=one.grid.solid_angle / one.grid.solid_angle.mean() * told,
+        worth=one.grid.solid_angle / one.grid.solid_angle.mean() * one.looked,
         truth=truth,
         floor=(floor / unit).clamp_min(10 ** (floor_db / 10) / unit),
         sources=torch.zeros_like(truth).flatten(0, 1).index_add(0, place, sent).reshape(truth.shape),

@@ -263,9 +263,9 @@ def with_mirrors(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, 
 def discs(mirror: Mirror, patches: Patches, plane: int, reaches: tuple[float, float] = DISC) -> Tensor:
     """Points `[n, 3]`, a cell apart, all over discs of surface around where a mirror was seen to reflect.
 
-    Discs reach as far as the third nearest such place, so that sparse observations still close to one surface, but not
-    less or more than `reaches` [m]. Where
-    the `plane`, if it is one of the `patches`, has surface already there is none: its outline stays.
+    Discs reach as far as the third nearest such place, so that sparse observations still close to one surface, from the
+    least to the most of `reaches` [m]. Where the `plane`, if it is one of the `patches`, has surface already there is
+    none: its outline stays.
     """
     missing = torch.ones(len(mirror.points), dtype=torch.bool)
     if plane < len(patches):
