@@ -116,7 +116,8 @@ def _reconstruct(
 ) -> dict[int, Any]:
     """The models that COLMAP finds, by number.
 
-    Pictures are numbered before features are sought, and one thread maps: nothing hangs on which thread is first.
+    Pictures are numbered before features are sought, and one thread seeks, matches and maps: nothing hangs on which
+    thread is first.
     """
     database, sparse = work / "database.db", work / "sparse"
     sparse.mkdir()
@@ -129,11 +130,13 @@ def _reconstruct(
     try:
         pycolmap.Database.open(database).close()
         pycolmap.import_images(database, folder, mode, names, reader)
-        pycolmap.extract_features(database, folder, names, mode, reader, device=cpu)
+        extraction, matching = pycolmap.FeatureExtractionOptions(), pycolmap.FeatureMatchingOptions()
+        extraction.num_threads = matching.num_threads = 1
+        pycolmap.extract_features(database, folder, names, mode, reader, extraction, device=cpu)
         progress.update(1, "features found")
         verification = pycolmap.TwoViewGeometryOptions()
         verification.ransac.random_seed = seed
-        pycolmap.match_exhaustive(database, verification_options=verification, device=cpu)
+        pycolmap.match_exhaustive(database, matching, verification_options=verification, device=cpu)
         progress.update(2, "features matched")
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = options.mapper.num_threads = 1
