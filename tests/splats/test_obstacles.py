@@ -14,7 +14,7 @@ from torch import Tensor
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.native import native_core
 from rf3dgs.splats.gaussians import Gaussians
-from rf3dgs.splats.obstacles import CLEAR, Obstacles, visibility_of
+from rf3dgs.splats.obstacles import Obstacles, visibility_of
 from rf3dgs.splats.surface import sample_mesh
 from rf3dgs.splats.transmittance import segment_transmittance
 
@@ -273,10 +273,10 @@ def test_a_segment_that_is_known_to_be_free_is_cleared(seed: int) -> None:
     # Alone in its segment, a Gaussian in the middle of it keeps a twentieth, which counts as nothing.
     lump = Obstacles(torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.1), torch.tensor([0.9]))
     ends, free = (torch.tensor([[-1.0, 0, 0]]), torch.tensor([[1.0, 0, 0]])), torch.tensor([True])
-    assert float(lump.cleared(*ends, free).opacities) == pytest.approx(CLEAR, rel=1e-5)
-    aside = torch.tensor([0.0, 0.15, 0.0])  # one and a half standard deviations off: CLEAR / exp(-1.5^2 / 2)
+    assert float(lump.cleared(*ends, free).opacities) == pytest.approx(0.05, rel=1e-5)
+    aside = torch.tensor([0.0, 0.2, 0.0])  # two standard deviations off: 0.05 / exp(-2)
     assert float(lump.cleared(ends[0] + aside, ends[1] + aside, free).opacities) == pytest.approx(
-        CLEAR * math.exp(1.125), rel=1e-4
+        0.05 * math.exp(2), rel=1e-4
     )
     far = torch.tensor([0.0, 0.6, 0.0])
     assert float(lump.cleared(ends[0] + far, ends[1] + far, free).opacities) == pytest.approx(0.9)
@@ -300,7 +300,7 @@ def test_what_closed_segments_need_is_not_cleared() -> None:
     assert torch.equal(kept.opacities[:count], thing.opacities[:count])
     near = torch.tensor([[0.0, 0.0, 1.5], [0.0, 0.0, 1.5]]), torch.tensor([[1.8, 0.0, 1.5], [3.0, 0.5, 1.5]])
     gone = thing.cleared(*near, torch.tensor([True, False]))
-    assert float(gone.opacities[-1]) == pytest.approx(CLEAR, rel=1e-4)
+    assert float(gone.opacities[-1]) == pytest.approx(0.05, rel=1e-4)
     assert torch.equal(gone.opacities[:count], thing.opacities[:count])
     with pytest.raises(InputError, match=r"free must be \[segment\] for 2 segments; got \[3\]"):
         thing.cleared(*near, torch.ones(3, dtype=torch.bool))

@@ -286,7 +286,7 @@ def squared(surfaces: Surfaces) -> Surfaces:
     planes, patches = surfaces.planes, surfaces.patches
     areas, normals, offsets = patches.areas, planes.normals.clone(), planes.offsets.clone()
     points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
-    walls, whole = normals[areas >= LARGE], torch.arange(len(planes))
+    walls, whole = large_normals(planes, patches), torch.arange(len(planes))
     small = [plane for plane in areas.argsort(descending=True, stable=True).tolist() if 0 < float(areas[plane]) < LARGE]
     if not len(walls):
         return surfaces
@@ -314,9 +314,9 @@ def squared(surfaces: Surfaces) -> Surfaces:
     return replace(surfaces, planes=planes, patches=Patches.of(planes, flat, patches.cell), plane_of=plane_of)
 
 
-def large_normals(surfaces: Surfaces) -> Tensor:
+def large_normals(planes: Planes, patches: Patches) -> Tensor:
     """Normals `[wall, 3]` of the large planes, along which most of what people build stands."""
-    return surfaces.planes.normals[surfaces.patches.areas >= LARGE]
+    return planes.normals[patches.areas >= LARGE]
 
 
 def oblique_planes(planes: Planes, patches: Patches) -> Tensor:
@@ -324,7 +324,7 @@ def oblique_planes(planes: Planes, patches: Patches) -> Tensor:
 
     Photographs make some where none is.
     """
-    walls = planes.normals[patches.areas >= LARGE]
+    walls = large_normals(planes, patches)
     if not len(walls):
         return torch.zeros(len(planes), dtype=torch.bool)
     return ((planes.normals @ walls.mT).abs() < SQUARE_ANGLE).all(-1)

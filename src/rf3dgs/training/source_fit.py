@@ -89,7 +89,8 @@ def fit_sources(
     surfaces = with_both_faces(consolidated(surfaces, obstacles.means), obstacles)
     obstacles = replace(obstacles, labels=surfaces.plane_of)
     sources = _known(direct, surfaces)
-    timed = timed_mirrors(spectra, tx.position, large_normals(surfaces)) if config.complete else []
+    walls = large_normals(surfaces.planes, surfaces.patches)
+    timed = timed_mirrors(spectra, tx.position, walls) if config.complete else []
     if timed:
         sources, surfaces, obstacles = _over(sources, with_timed(sources, timed), surfaces, obstacles)
     if config.square:
