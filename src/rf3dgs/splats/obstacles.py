@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,6 +25,7 @@ RAYS = 7  # of a soft gate
 FEW = 256  # segments that are answered sooner than other threads wake
 _SOFT_CHUNK = 200_000  # segments
 LARGEST_LABEL = 2**31 - 2
+COMPANY, ALONE = 6, 3.0  # the neighbour that is looked for, and how many times the usual distance is too far
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +132,22 @@ class Obstacles:
         widest.scatter_reduce_(0, gaussian, torch.where(free[segment], covered, 0.0), "amax")
         limit = torch.where(doubted, CLEAR / widest.clamp_min(1e-12), 1.0)
         return replace(self, opacities=torch.minimum(self.opacities, limit))
+
+    def without_strays(self) -> "Obstacles":
+        """The obstacles without those off all planes that stand alone: what photographs leave hanging in the air.
+
+        The sixth neighbour of such a one is more than three times as far as it usually is off the planes.
+        """
+        from scipy.spatial import KDTree
+
+        solid = (self.opacities >= self.min_opacity) & torch.isfinite(self.means).all(-1)
+        off = solid if self.labels is None else solid & (self.labels < 0)
+        if int(solid.sum()) <= COMPANY or not bool(off.any()):
+            return self
+        distance = KDTree(self.means[solid].numpy()).query(self.means[off].numpy(), k=COMPANY + 1)[0][:, -1]
+        stray = off.clone()
+        stray[off] = torch.from_numpy(distance > ALONE * np.median(distance))
+        return replace(self, opacities=torch.where(stray, 0.0, self.opacities))
 
     def soft(
         self,

@@ -232,6 +232,9 @@ class VisualConfig:
     """"flat": after three tenths and half of the run large planes are moved to where the photographs agree, those that
     bound the site are filled, and their Gaussians are flat from then on, which needs a world in metres; "free": the
     published method, which leaves haze there."""
+    look_again: bool = True
+    """Whether, after a fifth of the run, small things are added that photographs show and the Gaussians lack: places
+    where photographs differ most from their drawings are swept at full size. The published method does not."""
 
     backend: Literal["auto", "native", "reference", "gsplat"] = "auto"
     """Which rasterizer works."""

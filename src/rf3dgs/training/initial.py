@@ -73,8 +73,7 @@ def swept_start(
     depth is not known.
     """
     box = torch.tensor([list(low), list(high)], dtype=torch.float32)
-    corners = torch.stack([(camera.position - box).abs().amax(0) for camera in cameras])
-    far = float(torch.linalg.vector_norm(corners, dim=-1).max())
+    far = farthest(cameras, low, high)
     generator = random_at(seed, 0, "sweep")
     views, known = swept_surfaces(cameras, pictures, far, generator)
     known = [
@@ -84,13 +83,24 @@ def swept_start(
     if len(found.points) < LEAST_SWEPT:
         return random_start(cameras, count, low, high, degree=degree, seed=seed), []
     depths = [torch.where(mask, view.depth, 0.0) for view, mask in zip(views, known, strict=True)]
-    found = found.thinned(count, generator)
+    return pieces_of(found.thinned(count, generator), far, degree=degree), depths
+
+
+def farthest(cameras: Sequence[Camera], low: Sequence[float], high: Sequence[float]) -> float:
+    """How far [m] any camera is from any corner of a box."""
+    box = torch.tensor([list(low), list(high)], dtype=torch.float32)
+    corners = torch.stack([(camera.position - box).abs().amax(0) for camera in cameras])
+    return float(torch.linalg.vector_norm(corners, dim=-1).max())
+
+
+def pieces_of(found: Surfaces, far: float, *, degree: int) -> Gaussians:
+    """Flattened Gaussians on the points of surfaces, two or more, that were swept down to `far` [m]."""
     swept = Gaussians.from_points(found.points, found.colours, degree=degree, opacity=SWEPT_OPACITY)
     scales = swept.log_scales.clone()
     scales += math.log(SWEPT_SCALE)
     scales = scales.clamp_max(math.log(SWEPT_LARGEST * far))
     scales[:, 2] += math.log(FLATNESS)
-    return dataclasses.replace(swept, log_scales=scales, quats=upright(found.normals)), depths
+    return dataclasses.replace(swept, log_scales=scales, quats=upright(found.normals))
 
 
 def upright(normals: Tensor) -> Tensor:

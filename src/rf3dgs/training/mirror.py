@@ -56,7 +56,8 @@ def fit_mirror(
     solidity = geometry.opacities.detach()
     if "visibility" in config.without:
         solidity = torch.zeros_like(solidity)
-    obstacles = Obstacles(geometry.means, geometry.quats, geometry.scales, solidity, surfaces.plane_of)
+    shape = geometry.means, geometry.quats, geometry.scales
+    obstacles = Obstacles(*shape, solidity, surfaces.plane_of).without_strays()
     order = MIRROR_ORDER if config.mirror_order is None else config.mirror_order
     mirrors = SourceConfig(order=order, seed=config.seed)
     found = fit_sources(spectra, surfaces, obstacles, tx, mirrors, geometry=geometry)

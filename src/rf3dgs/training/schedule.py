@@ -9,6 +9,8 @@ PUBLISHED_STEPS = 30_000
 LARGEST_HASTE = 4.0
 SHORT_DEPTH_WEIGHT = 0.5
 FLATTEN_AT = (0.3, 0.5)
+LOOK_AGAIN_AT = 0.2
+RESERVE = 20  # one in so many Gaussians waits for what the second look finds
 
 
 @dataclass(frozen=True)
@@ -16,6 +18,7 @@ class Schedule:
     """Iterations of the visual stage, all resolved; see `VisualConfig` for their meaning."""
 
     steps: int
+    max_count: int
     double_at: tuple[int, int]
     densify_from: int
     densify_until: int
@@ -29,6 +32,7 @@ class Schedule:
     """Short runs learn faster: learning rates are multiplied by this, see `VisualConfig`."""
     depth_weight: float
     flatten_at: tuple[int, ...]
+    look_again_at: int | None
 
     @classmethod
     def of(cls, config: VisualConfig) -> "Schedule":
@@ -45,6 +49,7 @@ class Schedule:
 
         return cls(
             steps=steps,
+            max_count=config.max_count,
             double_at=config.double_at or (min(250, steps // 20), min(500, steps // 10)),
             densify_from=chosen(config.densify_from, 500, 10),
             densify_until=steps // 2 if config.densify_until is None else config.densify_until,
@@ -58,6 +63,7 @@ class Schedule:
             if config.depth_weight is None
             else config.depth_weight,
             flatten_at=tuple(max(1, round(share * steps)) for share in FLATTEN_AT) if config.walls == "flat" else (),
+            look_again_at=max(1, round(LOOK_AGAIN_AT * steps)) if config.look_again else None,
             haste=min(LARGEST_HASTE, max(1.0, (PUBLISHED_STEPS / steps) ** 0.5)),
         )
 
@@ -86,6 +92,14 @@ class Schedule:
     def flattens_after(self, iteration: int) -> bool:
         """Whether planes are found after an iteration."""
         return iteration + 1 in self.flatten_at
+
+    def looks_again_after(self, iteration: int) -> bool:
+        """Whether things that the Gaussians lack are sought after an iteration."""
+        return iteration + 1 == self.look_again_at
+
+    def reserve_at(self, iteration: int) -> int:
+        """How many Gaussians growth leaves to the second look after an iteration."""
+        return self.max_count // RESERVE if self.look_again_at is not None and iteration < self.look_again_at else 0
 
     def holds_after(self, iteration: int) -> bool:
         """Whether the Gaussians of planes are put back onto them after an iteration: as often as growth, and at the

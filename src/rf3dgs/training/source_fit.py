@@ -36,7 +36,7 @@ from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, re
 PROBES = 150
 PROBE_MARGIN = 0.5
 GATES = (0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05)  # of transmittance
-USUAL, USUAL_OF_MESHES = 0.4, 0.1  # what passes beside outlines
+USUAL, USUAL_OF_MESHES = 0.5, 0.1  # what passes beside outlines
 OF_MESHES = 0.9  # of the Gaussians of a mesh have one and the same opacity
 WORTH_A_CHANGE = 0.01  # share of what was looked at that another threshold must tell better
 UNTIMED = 5  # times as much is asked where no delay says whether a peak is the reflection
@@ -197,7 +197,7 @@ def cleared_by(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles
 def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Obstacles) -> PointSources:
     """The sources with the threshold that agrees best with who sees the transmitter, and which reflections shine.
 
-    Outlines of photographs ask for 0.3 to 0.5, which 40 positions do not tell apart, those of Gaussians sampled on a
+    Outlines of photographs ask for 0.4 to 0.7, which 40 positions do not tell apart, those of Gaussians sampled on a
     mesh for 0.1: 2 cm beside an edge 0.2 passes. What asks for another must say so clearly. A way that is open and
     should not be counts twice: it misleads a beam, where one that is missing only costs its own power. The line of
     sight counts thrice. Peaks without a delay prove less, and mirrors found by them are less sure: their ways stay

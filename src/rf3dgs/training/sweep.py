@@ -159,6 +159,13 @@ class Surfaces:
         areas = [view.depth[mask].square() for view, mask in zip(views, known, strict=True)]
         return cls(torch.cat(points), torch.cat(normals), torch.cat(colours), torch.cat(areas))
 
+    @classmethod
+    def joined(cls, parts: Sequence["Surfaces"]) -> "Surfaces":
+        """All of some parts, one after another."""
+        none = torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0)
+        columns = zip(none, *((p.points, p.normals, p.colours, p.areas) for p in parts), strict=True)
+        return cls(*(torch.cat(column) for column in columns))
+
     def only(self, chosen: Tensor) -> "Surfaces":
         """Some of them, by a mask or list."""
         return Surfaces(*(getattr(self, field.name)[chosen] for field in fields(self)))
@@ -180,8 +187,8 @@ def swept_surfaces(
         View(*shrunk(c, p, max(1, round(c.width / PIXELS_ACROSS)))) for c, p in zip(cameras, pictures, strict=True)
     ]
     inverse = torch.linspace(1 / far, 1 / (NEAREST * far), DEPTHS)
-    beside = on_threads(lambda index: _beside(views, index, far), range(len(views)))
-    partners = [[views[other] for other in others[:NEIGHBOURS]] for others in beside]
+    near = on_threads(lambda view: beside(view.camera, views, far), views)
+    partners = [[views[other] for other in others[:NEIGHBOURS]] for others in near]
     pairs = [(view, others) for view, others in zip(views, partners, strict=True) if others]
 
     def faced(pair: tuple[View, list[View]]) -> None:
@@ -205,7 +212,7 @@ def swept_surfaces(
         known.append(mask | _fill(view, others, planes, mask, far) if others and len(planes) else mask)
     return views, [
         upheld(view, mask, [(views[other], known[other]) for other in others])
-        for view, mask, others in zip(views, known, beside, strict=True)
+        for view, mask, others in zip(views, known, near, strict=True)
     ]
 
 
@@ -239,22 +246,21 @@ def _fill(view: View, partners: Sequence[View], planes: Planes, sure: Tensor, fa
     return filled
 
 
-def _beside(views: Sequence[View], index: int, far: float) -> list[int]:
-    """At most `WITNESSES` views that share most with view `index`, counted over a coarse grid of depths.
+def beside(own: Camera, views: Sequence[View], far: float) -> list[int]:
+    """At most `WITNESSES` of the views that share most with what a camera sees, counted over a coarse grid of depths.
 
     Those nearer than `BASELINE` of `far` [m] show depth less: they count by the square of their distance.
     """
-    own = views[index].camera
     probe = View(own.resized(12, 9), torch.zeros(9, 12, 3))
     depths = [torch.full((9, 12), share * far) for share in (0.1, 0.2, 0.35, 0.6)]
     points = torch.cat([probe.unproject(depth).reshape(-1, 3) for depth in depths])
     scores = []
-    for other, view in enumerate(views):
+    for view in views:
         moved = float(torch.linalg.vector_norm(view.camera.position - own.position))
         facing = float(view.camera.viewmat[2, :3] @ own.viewmat[2, :3])
         inside = project(view.camera, points)[1].float().mean()
         apart = min(1.0, moved / (BASELINE * far)) ** 2
-        scores.append(apart * float(inside) if other != index and facing > 0.3 else 0.0)
+        scores.append(apart * float(inside) if facing > 0.3 else 0.0)
     order = sorted(range(len(views)), key=lambda other: -scores[other])[:WITNESSES]
     return [other for other in order if scores[other] > 0.05]
 

@@ -27,14 +27,16 @@ from rf3dgs.splats.trainer import Trainer
 from rf3dgs.training.checkpoint import State, fingerprint
 from rf3dgs.training.config import VisualConfig
 from rf3dgs.training.flat import Flats, flatten_walls
-from rf3dgs.training.initial import camera_box, random_start, swept_start
+from rf3dgs.training.initial import camera_box, farthest, pieces_of, random_start, swept_start
 from rf3dgs.training.loop import random_at, train, view_at
 from rf3dgs.training.photographs import blending_weights, clamp_needles, depth_error, picture_of, shrunk
 from rf3dgs.training.schedule import Schedule
+from rf3dgs.training.second_look import missing_surfaces
 
 TRAINED = ("geometry", "opacity", "sh")
 HIGHER_BANDS_SLOWER = 20.0
 LARGEST_SURFACE = 0.05
+PHOTOS_OF_A_THING = 3  # by how many photographs a place is usually found: so many points make one Gaussian
 KEPT_TARGETS = 1 << 30  # bytes; targets that need more are made anew in each iteration
 BYTES_OF_TARGET = 36  # a pixel of a target with its statistics
 
@@ -185,7 +187,7 @@ class VisualStage:
                 generator=random_at(config.seed, iteration, "split"),
                 gradient_threshold=config.grow_gradient,
                 dense_fraction=config.split_size,
-                max_count=config.max_count,
+                max_count=config.max_count - schedule.reserve_at(iteration),
                 opacity_floor=config.prune_opacity,
                 largest_scale=config.prune_size * self.extent if limits_size else None,
             )
@@ -201,12 +203,30 @@ class VisualStage:
             if found is not None:
                 self.flats = found[1]
                 trainer.follow(found[0])
+        if schedule.looks_again_after(iteration):
+            self._add_missing(trainer, iteration)
         if schedule.holds_after(iteration) and self.flats is not None:
             for name, value in self.flats.held(trainer.gaussians()).tensors().items():
                 if name in ("means", "quats", "log_scales"):
                     trainer.place(name, value)
         if schedule.resets_after(iteration):
             trainer.assign("logit_opacities", reset_opacity(trainer.gaussians()).logit_opacities)
+
+    def _add_missing(self, trainer: Trainer, iteration: int) -> None:
+        """Add Gaussians on small things that photographs show and the present Gaussians lack, on no plane so far."""
+        config, now = self.config, trainer.gaussians().detach()
+        low, high = config.bounds or camera_box(self.cameras)
+        far = farthest(self.cameras, low, high)
+        found = missing_surfaces(now, self.cameras, self.pictures, far, config.backend)
+        room = min(config.max_count - len(now), round(len(found.points) / PHOTOS_OF_A_THING))
+        if room < 2:
+            return
+        found = found.thinned(room, random_at(config.seed, iteration, "second look"))
+        new = pieces_of(found, far, degree=config.degree)
+        source = torch.cat((torch.arange(len(now)), torch.zeros(len(new), dtype=torch.long)))
+        trainer.follow(Change(Gaussians.join((now, new)), source, torch.arange(len(source)) >= len(now)))
+        if self.flats is not None:
+            self.flats = Flats(self.flats.planes, torch.cat((self.flats.plane_of, torch.full((len(new),), -1))))
 
     def _follow(self, trainer: Trainer, change: Change) -> None:
         """Go on with a changed population, the planes' own too."""
