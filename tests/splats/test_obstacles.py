@@ -323,3 +323,30 @@ def test_wrong_shapes_and_missing_labels_are_refused() -> None:
         two_plates().transmittance(start, start, skip_start=torch.zeros(3))
     with pytest.raises(InputError, match="normals must be"):
         visibility_of(bare, cloud.means, cloud.means[:1], torch.zeros(3))
+
+
+def test_what_stands_alone_off_all_planes_stops_nothing() -> None:
+    ball = scattered([1.0, -0.3, 1.0], [1.6, 0.3, 1.6], 300, seed=2)
+    alone = torch.tensor([[-1.0, 0.0, 1.5], [3.0, 0.0, 1.0]])
+    hung = Gaussians.from_points(torch.cat((ball, alone)), degree=0, opacity=0.9)
+    scales = torch.full_like(hung.log_scales, math.log(0.05))
+    cloud = Gaussians.join((plate(4.0), replace(hung, log_scales=scales, sh=torch.zeros(len(hung), 1, 3))))
+    labels = torch.full((len(cloud),), -1)
+    wall = len(cloud) - len(hung)
+    labels[:wall] = 0
+    before = obstacles_of(cloud, labels)
+    after = before.without_strays()
+    assert (after.opacities == 0).nonzero().flatten().tolist() == [len(cloud) - 2, len(cloud) - 1]
+    assert torch.equal(after.opacities[:-2], before.opacities[:-2])
+    past = torch.tensor([[-1.0, -2.0, 1.5]]), torch.tensor([[-1.0, 2.0, 1.5]])
+    assert float(before.transmittance(*past)) < 0.2
+    assert float(after.transmittance(*past)) == 1.0
+
+
+def test_an_even_surface_has_no_strays_and_a_few_gaussians_none() -> None:
+    even = obstacles_of(plate(0.0))
+    assert torch.equal(even.without_strays().opacities, even.opacities)
+    few = obstacles_of(plate(0.0).subset(torch.arange(5)))
+    assert few.without_strays() is few
+    labelled = obstacles_of(plate(0.0), torch.zeros(len(plate(0.0)), dtype=torch.long))
+    assert labelled.without_strays() is labelled
