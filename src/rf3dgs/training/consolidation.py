@@ -16,7 +16,7 @@ from rf3dgs.geometry import Patches, Planes, Surfaces
 from rf3dgs.geometry.patches import closed, rim, widened
 from rf3dgs.splats.obstacles import Obstacles
 
-LARGE = 5.0  # m^2
+LARGE, HANGS = 5.0, 2  # m^2 in one piece, and cells by which its parts are widened to touch
 PIECE_ANGLE = 0.985  # cosine of 10 degrees
 PIECE_DISTANCE = 0.25  # m
 SKIN, SKIN_ANGLE = 0.30, 0.7  # m, cosine of 45 degrees
@@ -52,9 +52,9 @@ def consolidated(surfaces: Surfaces, means: Tensor) -> Surfaces:
     if not len(planes):
         return surfaces
     points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
-    areas, whole = patches.areas, torch.arange(len(planes))
+    areas, whole, walls = patches.areas, torch.arange(len(planes)), large_planes(patches)
     for large in areas.argsort(descending=True, stable=True).tolist():
-        if float(areas[large]) < LARGE or int(whole[large]) != large:
+        if not bool(walls[large]) or int(whole[large]) != large:
             continue
         normal, offset = planes.normals[large], planes.offsets[large]
         for piece in range(len(planes)):
@@ -81,12 +81,12 @@ def with_both_faces(surfaces: Surfaces, obstacles: Obstacles) -> Surfaces:
     their Gaussians do. Planes keep their numbers, new ones follow.
     """
     planes, patches, plane_of = surfaces.planes, surfaces.patches, surfaces.plane_of.clone()
-    areas, points = patches.areas, [surface_points(planes, patches, plane) for plane in range(len(planes))]
+    points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
     normals, offsets = list(planes.normals), list(planes.offsets)
-    large = torch.cat((areas >= LARGE, torch.zeros(1, dtype=torch.bool)))  # the last for the label -1
+    large = torch.cat((large_planes(patches), torch.zeros(1, dtype=torch.bool)))  # the last for the label -1
     free = (obstacles.opacities >= obstacles.min_opacity) & ~large[plane_of]
     for plane in range(len(planes)):
-        if not 0 < float(areas[plane]) < LARGE or not len(points[plane]):
+        if bool(large[plane]) or not len(points[plane]):
             continue
         near = (obstacles.means @ normals[plane] - offsets[plane]).abs() < DEEPEST / 2
         near &= free & ((surfaces.normals @ normals[plane]).abs() > SKIN_ANGLE)
@@ -105,7 +105,7 @@ def with_both_faces(surfaces: Surfaces, obstacles: Obstacles) -> Surfaces:
         normals.append(-normals[plane])
         points.append(points[plane][faces[1]])
         points[plane] = points[plane][faces[0]]
-    _turn_outwards(normals, offsets, points, areas, patches.cell)
+    _turn_outwards(normals, offsets, points, large[:-1], patches.cell)
     both = Planes(torch.stack(normals), torch.stack(offsets)) if normals else planes
     flat = [
         part - (part @ both.normals[at] - both.offsets[at])[:, None] * both.normals[at]
@@ -115,13 +115,13 @@ def with_both_faces(surfaces: Surfaces, obstacles: Obstacles) -> Surfaces:
 
 
 def _turn_outwards(
-    normals: list[Tensor], offsets: list[Tensor], points: Sequence[Tensor], areas: Tensor, cell: float
+    normals: list[Tensor], offsets: list[Tensor], points: Sequence[Tensor], large: Tensor, cell: float
 ) -> None:
-    """Turn those of the small planes with `areas` `[plane]` that lie behind another and face the same way, in place."""
-    for plane in range(len(areas)):
-        for other in range(len(areas)):
+    """Turn those of the planes that are not `large` `[plane]` which lie behind such another and face the same way."""
+    for plane in range(len(large)):
+        for other in range(len(large)):
             behind = float(offsets[other] - offsets[plane])
-            small = len(points[plane]) and max(float(areas[plane]), float(areas[other])) < LARGE
+            small = len(points[plane]) and not bool(large[plane] | large[other])
             if not small or not BESIDE < behind < DEEPEST or float(normals[plane] @ normals[other]) < PIECE_ANGLE:
                 continue
             across = _beside(points[plane], points[other] - behind * normals[other], cell)
@@ -159,11 +159,11 @@ def flat_pieces(surfaces: Surfaces, obstacles: Obstacles) -> Surfaces:
     which does not; where the plane itself lies is not asked.
     """
     planes, patches, plane_of = surfaces.planes, surfaces.patches, surfaces.plane_of.clone()
-    points, areas = [], patches.areas
+    points, large = [], large_planes(patches).tolist()
     for plane in range(len(planes)):
         middles, grid = surface_points(planes, patches, plane), patches.grid(plane)
         own = torch.nonzero((plane_of == plane) & (obstacles.opacities >= obstacles.min_opacity)).squeeze(-1)
-        if float(areas[plane]) < LARGE and len(own):
+        if not large[plane] and len(own):
             means = obstacles.means[own]
             pieces = torch.zeros(grid.shape, dtype=torch.int32)
             label(widened(grid, 1).numpy(), [[1] * 3] * 3, output=pieces.numpy())
@@ -215,9 +215,9 @@ def outlined(planes: Planes, patches: Patches, obstacles: Obstacles) -> Patches:
     outside. That matters where a way passes beside a thing; large planes end at others. Surface far from where
     Gaussians stand, as that of mirrors which photographs did not show, stays.
     """
-    points, areas = [], patches.areas
+    points, large = [], large_planes(patches).tolist()
     for plane in range(len(planes)):
-        if float(areas[plane]) >= LARGE:
+        if large[plane]:
             points.append(surface_points(planes, patches, plane))
             continue
         middles, through = surface_points(planes, patches, plane), THROUGH * planes.normals[plane]
@@ -238,9 +238,10 @@ def standing(planes: Planes, patches: Patches) -> Patches:
     large plane's surface mostly stands on it. A board and the floor mirror together right there.
     """
     points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
-    grounds = torch.nonzero(patches.areas >= LARGE).squeeze(-1).tolist()
+    large = large_planes(patches)
+    grounds = torch.nonzero(large).squeeze(-1).tolist()
     steps = torch.arange(0.0, 1.5 * FOOT, patches.cell)
-    for plane in torch.nonzero(patches.areas < LARGE).squeeze(-1).tolist():
+    for plane in torch.nonzero(~large).squeeze(-1).tolist():
         cells, normal = points[plane], planes.normals[plane]
         for ground in grounds:
             slope = planes.normals[ground] - (planes.normals[ground] @ normal) * normal
@@ -261,11 +262,10 @@ def with_skins(surfaces: Surfaces, means: Tensor) -> Tensor:
 
     Near is within 30 cm and 45 degrees, before or behind its surface.
     """
-    labels = surfaces.plane_of.clone()
-    areas = surfaces.patches.areas
-    for plane in areas.argsort(descending=True, stable=True).tolist():
-        if float(areas[plane]) < LARGE:
-            break
+    labels, large = surfaces.plane_of.clone(), large_planes(surfaces.patches)
+    for plane in surfaces.patches.areas.argsort(descending=True, stable=True).tolist():
+        if not bool(large[plane]):
+            continue
         normal = surfaces.planes.normals[plane]
         height = (means @ normal - surfaces.planes.offsets[plane]).abs()
         skin = (labels < 0) & (height < SKIN) & ((surfaces.normals @ normal).abs() > SKIN_ANGLE)
@@ -287,7 +287,8 @@ def squared(surfaces: Surfaces) -> Surfaces:
     areas, normals, offsets = patches.areas, planes.normals.clone(), planes.offsets.clone()
     points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
     walls, whole = large_normals(planes, patches), torch.arange(len(planes))
-    small = [plane for plane in areas.argsort(descending=True, stable=True).tolist() if 0 < float(areas[plane]) < LARGE]
+    large = large_planes(patches).tolist()
+    small = [p for p in areas.argsort(descending=True, stable=True).tolist() if float(areas[p]) > 0 and not large[p]]
     if not len(walls):
         return surfaces
     done: list[int] = []
@@ -316,7 +317,21 @@ def squared(surfaces: Surfaces) -> Surfaces:
 
 def large_normals(planes: Planes, patches: Patches) -> Tensor:
     """Normals `[wall, 3]` of the large planes, along which most of what people build stands."""
-    return planes.normals[patches.areas >= LARGE]
+    return planes.normals[large_planes(patches)]
+
+
+def large_planes(patches: Patches) -> Tensor:
+    """Which planes `[P]` have 5 m^2 of surface in one piece, gaps of some cells aside.
+
+    Tops of a table and of benches, however many, are no wall.
+    """
+    large = patches.areas >= LARGE
+    for plane in torch.nonzero(large).squeeze(-1).tolist():
+        grid = patches.grid(plane)
+        pieces = torch.zeros(grid.shape, dtype=torch.int32)
+        label(widened(grid, HANGS).numpy(), [[1] * 3] * 3, output=pieces.numpy())
+        large[plane] = float(torch.bincount(pieces[grid]).max()) * patches.cell**2 >= LARGE
+    return large
 
 
 def oblique_planes(planes: Planes, patches: Patches) -> Tensor:

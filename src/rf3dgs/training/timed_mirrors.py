@@ -19,7 +19,7 @@ from rf3dgs.field.sources import PointSources
 from rf3dgs.geometry import Patches, Planes
 from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Spectrum
-from rf3dgs.training.consolidation import surface_points
+from rf3dgs.training.consolidation import large_planes, surface_points
 from rf3dgs.training.line_of_sight import standing_out
 from rf3dgs.training.virtual import DISC, NEAREST_IMAGE, PEAKS, Mirror, discs
 
@@ -32,6 +32,7 @@ SAME_ANGLE, SAME_DISTANCE = math.cos(math.radians(10.0)), 0.5
 BESIDE_AXIS = 0.1  # m
 SEEN_ANGLE, SEEN_DISTANCE, BESIDE = math.cos(math.radians(15.0)), 0.15, 0.5  # of mirrors that few positions saw
 FEW_DISC = (0.2, 0.2)  # m of surface around their reflections where there is no plane
+SMALL_DISC = (0.2, 0.4)  # and around any where the plane is small: tops of a table and of benches lie in one
 ROUNDS = 5
 
 
@@ -92,7 +93,7 @@ def with_timed(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, Pa
     assert sources.patches is not None
     normals, offsets = list(sources.planes.normals), list(sources.planes.offsets)
     points = [surface_points(sources.planes, sources.patches, plane) for plane in range(len(sources.planes))]
-    areas = sources.patches.areas
+    areas, large = sources.patches.areas, large_planes(sources.patches).tolist()
     taken: set[int] = set()
     for mirror in mirrors:
         middle = mirror.points.median(0).values
@@ -118,9 +119,9 @@ def with_timed(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, Pa
             offsets.append(mirror.offset)
             points.append(torch.zeros(0, 3))
         taken.add(plane)
-        points[plane] = torch.cat(
-            (points[plane], discs(mirror, sources.patches, plane, FEW_DISC if few and not alike else DISC))
-        )
+        wide, narrow = (large[plane], SMALL_DISC) if alike else (not few, FEW_DISC)
+        reaches = DISC if wide else narrow
+        points[plane] = torch.cat((points[plane], discs(mirror, sources.patches, plane, reaches)))
     planes = Planes(torch.stack(normals), torch.stack(offsets))
     flat = [
         part - (part @ n - o)[:, None] * n for part, n, o in zip(points, planes.normals, planes.offsets, strict=True)

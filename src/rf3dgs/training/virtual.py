@@ -20,7 +20,7 @@ from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
-from rf3dgs.training.consolidation import LARGE, surface_points
+from rf3dgs.training.consolidation import large_planes, surface_points
 from rf3dgs.training.line_of_sight import SEEN_OVER_RING, standing_out
 
 PEAKS = 16
@@ -176,7 +176,7 @@ def find_mirrors(
 def _of_one_reflection(mirrors: list[Mirror], sources: PointSources) -> list[Mirror]:
     """The mirrors whose images are not images of images in the others and the large planes; weak ones go first."""
     kept = list(mirrors)
-    large = torch.zeros(0, dtype=torch.bool) if sources.patches is None else sources.patches.areas >= LARGE
+    large = torch.zeros(0, dtype=torch.bool) if sources.patches is None else large_planes(sources.patches)
     for mirror in reversed(mirrors):
         others = [one for one in kept if one is not mirror]
         normals = torch.cat((sources.planes.normals[large], *(one.normal[None] for one in others)))
