@@ -27,6 +27,7 @@ from rf3dgs.splats.surface import sample_mesh
 from rf3dgs.training.config import SourceConfig
 from rf3dgs.training.consolidation import (
     flat_pieces,
+    large_planes,
     oblique_planes,
     outlined,
     squared,
@@ -482,6 +483,39 @@ def test_where_a_plane_has_surface_a_mirror_adds_none():
     filled = seen_at([0.3, 0.0, 1.8], [1.0, 0.0, 0.9])
     assert bool(filled.holds(torch.tensor([1.0, 0.0, 0.9]), torch.tensor(0)))
     assert float(filled.areas[0]) > float(patches.areas[0]) + 0.3
+
+
+@pytest.mark.parametrize(("side", "wide"), [(1.6, False), (3.0, True)])
+def test_surface_about_reflections_is_narrow_off_small_planes_and_wide_off_large_ones(side: float, wide: bool):
+    """Two reflections 1.3 m apart, beyond a table's end: 40 cm about each; beyond a wall's they are joined."""
+    planes = Planes(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1))
+    steps = torch.arange(0.05, side, 0.1)
+    patches = Patches.of(planes, [torch.cartesian_prod(steps, steps, torch.zeros(1))])
+    sources = PointSources(
+        torch.tensor([1.0, 1.0, 3.0]), FREQUENCY, planes, patches, sequences(1, 1), torch.zeros(1, 3)
+    )
+    spots = torch.tensor([[side + 1.0, 0.5, 0.0], [side + 1.0, 1.8, 0.0]])
+    spots = torch.cat((spots, spots + torch.tensor([0.05, 0.0, 0.0])))
+    found = Mirror(planes.normals[0], planes.offsets[0], spots, torch.tensor([1.0, 1.0, -3.0]), torch.zeros(4, 3))
+    after = with_timed(sources, [found])[1]
+    assert bool(after.holds(torch.tensor([side + 1.0, 1.15, 0.0]), torch.tensor(0))) == wide
+    assert (float(after.areas[0] - patches.areas[0]) > 1.4) == wide
+    assert bool(after.holds(spots, torch.zeros(4, dtype=torch.long)).all())
+
+
+def test_a_plane_is_large_by_what_hangs_together():
+    """Three tops of 2 m^2 each in one plane are none; nor is what gaps of a few cells cut told apart."""
+    planes = Planes(torch.tensor([[0.0, 0.0, 1.0]]), torch.full((1,), 0.45))
+
+    def of(*starts: float) -> bool:
+        top = torch.cartesian_prod(torch.arange(0.05, 1.0, 0.1), torch.arange(0.05, 2.0, 0.1), torch.tensor([0.45]))
+        cells = torch.cat([top + torch.tensor([start, 0.0, 0.0]) for start in starts])
+        return bool(large_planes(Patches.of(planes, [cells]))[0])
+
+    assert not of(0.0, 1.0)
+    assert of(0.0, 1.0, 2.0)
+    assert of(0.0, 1.3, 2.6)
+    assert not of(0.0, 3.0, 6.0)
 
 
 def test_ways_of_two_reflections_tell_what_a_plane_reflects(fitted):
