@@ -23,6 +23,7 @@ SKIN, SKIN_ANGLE = 0.30, 0.7  # m, cosine of 45 degrees
 SQUARE_ANGLE = math.cos(math.radians(7.0))
 TOGETHER = 0.08  # m
 THROUGH = 0.2  # m to both sides of a plane, within which its Gaussians stand
+HOLE = 1.0  # m^2
 OUTSIDE = 2  # cells by which an outline may lie outside
 SOLID = 0.2  # of a ray; Gaussians reach over an edge, and a mirror that is none costs more than one that is missing
 BESIDE = 0.03  # m off the rest of its plane, from which a piece is another thing's
@@ -213,12 +214,21 @@ def outlined(planes: Planes, patches: Patches, obstacles: Obstacles) -> Patches:
 
     Cells are found by what a Gaussian may cover, so that surface has no gaps; outlines then lie up to two cells
     outside. That matters where a way passes beside a thing; large planes end at others. Surface far from where
-    Gaussians stand, as that of mirrors which photographs did not show, stays.
+    Gaussians stand, as that of mirrors which photographs did not show, stays. Holes of large planes under a square
+    metre are closed: no door is so small, and behind boxes photographs and echoes leave such ones.
     """
+    from scipy.ndimage import binary_fill_holes
+
     points, large = [], large_planes(patches).tolist()
     for plane in range(len(planes)):
         if large[plane]:
-            points.append(surface_points(planes, patches, plane))
+            grid = patches.grid(plane)
+            holes = torch.zeros(grid.shape, dtype=torch.int32)
+            label((torch.from_numpy(binary_fill_holes(grid.numpy())) & ~grid).numpy(), output=holes.numpy())
+            small = torch.bincount(holes.flatten()) * patches.cell**2 < HOLE
+            small[0] = False
+            middles = patches.low[plane] + (torch.nonzero(grid | small[holes]) + 0.5) * patches.cell
+            points.append(middles @ patches.axes[plane] + planes.offsets[plane] * planes.normals[plane])
             continue
         middles, through = surface_points(planes, patches, plane), THROUGH * planes.normals[plane]
         kept = patches.grid(plane)
