@@ -464,6 +464,21 @@ def test_an_outline_is_that_of_the_thing(spacing):
     assert 0.01 * (len(found) - len(own)) == pytest.approx(0.3, abs=0.11)
 
 
+@pytest.mark.parametrize(("side", "hole", "closed"), [(4.0, 0.8, True), (4.0, 1.4, False), (2.0, 0.8, False)])
+def test_small_holes_of_large_planes_are_closed_and_doors_stay(side: float, hole: float, closed: bool):
+    planes = Planes(torch.tensor([[0.0, 1.0, 0.0]]), torch.zeros(1))
+    steps = torch.arange(0.05, side, 0.1)
+    cells = torch.cartesian_prod(steps, torch.zeros(1), steps)
+    gone = ((cells[:, [0, 2]] - side / 2).abs() < hole / 2).all(-1)
+    patches = Patches.of(planes, [cells[~gone]])
+    nothing = Obstacles(torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0))
+    after = outlined(planes, patches, nothing)
+    before = float(patches.areas[0])
+    expected = side**2 if closed else before
+    assert before == pytest.approx(side**2 - hole**2, abs=0.02)
+    assert float(after.areas[0]) == pytest.approx(expected, abs=0.02)
+
+
 def test_where_a_plane_has_surface_a_mirror_adds_none():
     """A partition of 2 x 1.9 m that reflected near its top keeps its height; where it has a hole it is closed."""
     planes = Planes(torch.tensor([[0.0, 1.0, 0.0]]), torch.zeros(1))
