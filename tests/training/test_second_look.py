@@ -9,6 +9,7 @@ from tests.geometry.test_search import plain_wall
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import Camera, pinhole_grid
 from rf3dgs.data.photo import Photo
+from rf3dgs.geometry.planes import Planes
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import C0
 from rf3dgs.splats.surface import sample_mesh
@@ -118,7 +119,8 @@ def test_training_looks_again_once(scene, look_again: bool) -> None:
     for step in range(3):
         stage.step(step)
     before = near_sign(stage.gaussians())
-    stage.flats = Flats(plane_of=torch.zeros(len(stage.gaussians()), dtype=torch.long), planes=None)  # type: ignore
+    plane = Planes(torch.tensor([[0.0, 1.0, 0.0]]), torch.zeros(1))
+    stage.flats = Flats(plane, torch.zeros(len(stage.gaussians()), dtype=torch.long))
     stage.step(3)
     assert (near_sign(stage.gaussians()) > before + 30) == look_again
     assert stage.flats is not None
