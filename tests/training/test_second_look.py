@@ -45,6 +45,10 @@ def sign() -> Gaussians:
     return painted(board, seed=2)
 
 
+def pictures_of(gaussians: Gaussians, cameras: list[Camera]) -> list[torch.Tensor]:
+    return [(255 * render_photo(gaussians, camera)).to(torch.uint8) for camera in cameras]
+
+
 @pytest.fixture(scope="module")
 def scene() -> tuple[list[Camera], list[torch.Tensor], list[torch.Tensor]]:
     """Cameras, and what they see of the wall with the sign and of the wall alone."""
@@ -52,8 +56,7 @@ def scene() -> tuple[list[Camera], list[torch.Tensor], list[torch.Tensor]]:
     places = [(0.4, 5.8), (1.6, 6.2), (2.6, 6.0), (3.8, 6.1), (4.9, 5.9), (5.6, 6.0)]
     cameras = [Camera.of(Pose.look_at((x, y, 1.6), (3.0, 0.0, 1.4)), grid) for x, y in places]
     both = Gaussians.join((wall(), sign()))
-    pictures = [[(255 * render_photo(one, camera)).to(torch.uint8) for camera in cameras] for one in (both, wall())]
-    return cameras, *pictures
+    return cameras, pictures_of(both, cameras), pictures_of(wall(), cameras)
 
 
 def away(points: torch.Tensor) -> torch.Tensor:
@@ -92,7 +95,7 @@ def test_large_photographs_are_looked_at_in_copies(scene) -> None:
     large = [camera.resized(6 * camera.width, 6 * camera.height) for camera in scene[0]]
     assert large[0].width > 1.5 * ACROSS
     both = Gaussians.join((wall(), sign()))
-    found = missing_surfaces(wall(), large, [(255 * render_photo(both, one)).to(torch.uint8) for one in large], FAR)
+    found = missing_surfaces(wall(), large, pictures_of(both, large), FAR)
     assert len(found.points) > 100
     assert float(away(found.points).quantile(0.8)) < 0.15
 
