@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from rf3dgs.core.errors import InputError
-from rf3dgs.geometry import SurfaceConfig, Surfaces, find_surfaces
+from rf3dgs.geometry import Patches, Planes, SurfaceConfig, Surfaces, find_surfaces
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.surface import sample_mesh
 
@@ -107,3 +107,18 @@ def test_viewpoints_that_are_no_points_are_refused() -> None:
         find_surfaces(room(600), torch.zeros(4, 2))
     with pytest.raises(InputError, match="viewpoints must be finite"):
         find_surfaces(room(600), torch.tensor([[math.nan, 0.0, 0.0]]), SurfaceConfig())
+
+
+def test_a_plane_is_large_by_what_hangs_together():
+    """Three tops of 2 m^2 each in one plane are none; nor is what gaps of a few cells cut told apart."""
+    planes = Planes(torch.tensor([[0.0, 0.0, 1.0]]), torch.full((1,), 0.45))
+
+    def of(*starts: float) -> bool:
+        top = torch.cartesian_prod(torch.arange(0.05, 1.0, 0.1), torch.arange(0.05, 2.0, 0.1), torch.tensor([0.45]))
+        cells = torch.cat([top + torch.tensor([start, 0.0, 0.0]) for start in starts])
+        return bool(Patches.of(planes, [cells]).large[0])
+
+    assert not of(0.0, 1.0)
+    assert of(0.0, 1.0, 2.0)
+    assert of(0.0, 1.3, 2.6)
+    assert not of(0.0, 3.0, 6.0)

@@ -13,13 +13,13 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.geometry import Patches, Planes
+from rf3dgs.geometry.patches import surface_points
 from rf3dgs.propagation.room import shoebox
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.surface import normals, sample_mesh
 from rf3dgs.training import corrected, geometry_from_spectra, radio_geometry
-from rf3dgs.training.consolidation import surface_points
 from rf3dgs.training.echo_planes import REACH, behind, bounding, filled, in_free_space, refined_by_echoes
 from rf3dgs.training.echoes import Echoes, echoes_of, merged
 
@@ -334,7 +334,7 @@ def test_a_wall_that_echoes_tell_badly_lies_on_that_of_the_geometry():
     assert float(found.offsets[0]) == -6.0
     assert torch.equal(found.normals[1], walls.normals[1])
     assert float(found.offsets[1]) == pytest.approx(-6.6)
-    cells = surface_points(found, moved, 0)
+    cells = surface_points(found, moved)[0]
     assert float((cells[:, 0] - 6.0).abs().max()) < 1e-5
     assert float(cells[:, 1].min()) < 0.2
     assert float(cells[:, 1].max()) > 1.8

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -15,6 +16,7 @@ CELL_OF_SIZE = 0.75  # cells per standard deviation, at least: wide enough for t
 REACH = 1.5  # standard deviations of a Gaussian that count as surface
 SPOTS = 5  # points along each axis of a Gaussian by which its cells are found
 MOST_CELLS = 50_000_000
+LARGE, HANGS = 5.0, 2  # m^2 in one piece, and cells by which its parts are widened to touch
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +107,19 @@ class Patches:
         """Occupied area `[plane]` [m^2]."""
         return torch.tensor([float(self.grid(plane).sum()) * self.cell**2 for plane in range(len(self))])
 
+    @cached_property
+    def large(self) -> Tensor:
+        """Which planes `[plane]` have 5 m^2 of surface in one piece, gaps of some cells aside.
+
+        Tops of a table and of benches, however many, are no wall.
+        """
+        large = self.areas >= LARGE
+        for plane in torch.nonzero(large).squeeze(-1).tolist():
+            grid = self.grid(plane)
+            largest = torch.bincount(pieces_of(grid, HANGS)[grid]).max()
+            large[plane] = float(largest) * self.cell**2 >= LARGE
+        return large
+
     def tensors(self) -> dict[str, Tensor]:
         """The tensors by name, for files."""
         parts = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -115,6 +130,38 @@ class Patches:
         """The patches of a mapping as `tensors()` gives it; cells are 10 cm wide where it does not say."""
         parts = {field.name: tensors[field.name] for field in fields(cls) if field.name != "cell"}
         return cls(**parts, cell=float(tensors["cell"]) if "cell" in tensors else CELL)
+
+
+def surface_points(planes: Planes, patches: Patches) -> list[Tensor]:
+    """The middles, `[cell, 3]` [m] of each plane, of the cells that are surface."""
+    points = []
+    for plane in range(len(planes)):
+        local = patches.low[plane] + (torch.nonzero(patches.grid(plane)) + 0.5) * patches.cell
+        points.append(local @ patches.axes[plane] + planes.offsets[plane] * planes.normals[plane])
+    return points
+
+
+def pieces_of(grid: Tensor, gap: int) -> Tensor:
+    """The number, from 1, of the piece that each cell `[row, column]` is of; 0 elsewhere.
+
+    What touches, corners too, after it was widened by `gap` cells is one piece, with the cells by which it was widened.
+    """
+    from scipy.ndimage import label
+
+    pieces = torch.zeros(grid.shape, dtype=torch.int32)
+    label(widened(grid, gap).numpy(), [[1] * 3] * 3, output=pieces.numpy())
+    return pieces
+
+
+def without_holes(grid: Tensor, most: int) -> Tensor:
+    """Cells `[row, column]` that are True, and holes among them of fewer than `most` cells."""
+    from scipy.ndimage import binary_fill_holes, label
+
+    holes = torch.zeros(grid.shape, dtype=torch.int32)
+    label((torch.from_numpy(binary_fill_holes(grid.numpy())) & ~grid).numpy(), output=holes.numpy())
+    small = torch.bincount(holes.flatten()) < most
+    small[0] = False
+    return grid | small[holes]
 
 
 def closed(grid: Tensor) -> Tensor:

@@ -1,46 +1,24 @@
-"""Planes of photographs made fit for mirrors: walls whole, boards of two faces, small things square, flat, outlined.
+"""Planes of photographs made whole and square for mirrors.
 
 Photographs leave walls in pieces that lie a little beside each other; for mirrors a wall is one plane, and none of the
 Gaussians that stand for it may stand in the way of its own reflection.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from scipy.ndimage import label
 from torch import Tensor
 
 from rf3dgs.geometry import Patches, Planes, Surfaces
-from rf3dgs.geometry.patches import closed, rim, widened
-from rf3dgs.splats.obstacles import Obstacles
+from rf3dgs.geometry.patches import surface_points, without_holes
 
-LARGE, HANGS = 5.0, 2  # m^2 in one piece, and cells by which its parts are widened to touch
 PIECE_ANGLE = 0.985  # cosine of 10 degrees
 PIECE_DISTANCE = 0.25  # m
 SKIN, SKIN_ANGLE = 0.30, 0.7  # m, cosine of 45 degrees
 SQUARE_ANGLE = math.cos(math.radians(7.0))
 TOGETHER = 0.08  # m
-THROUGH = 0.2  # m to both sides of a plane, within which its Gaussians stand
 HOLE = 1.0  # m^2
-OUTSIDE = 2  # cells by which an outline may lie outside
-SOLID = 0.2  # of a ray; Gaussians reach over an edge, and a mirror that is none costs more than one that is missing
-BESIDE = 0.03  # m off the rest of its plane, from which a piece is another thing's
-NARROW = 0.16  # m on either side for four fifths of a strip, of one of 40 cm: photographs make such of round columns
-BENT, BOW = 0.6, 0.015  # 1 / m and m: what is rounder, and bulges more, is no mirror
-FEWEST = 12  # Gaussians that tell whether a piece is flat
-THIN, APART = 0.05, 3.5  # m between two faces, and how many median deviations of each
-HALF = 0.5  # of the cells of one face must have the other one across
-DEEPEST = 0.3  # m between the faces of a board
-FOOT, STEEP = 0.3, 0.5  # m between a board and what it stands on, and least square of the sine of their angle
-
-
-def surface_points(planes: Planes, patches: Patches, plane: int) -> Tensor:
-    """The middles `[n, 3]` [m] of the cells of one plane that are surface."""
-    cell = torch.nonzero(patches.grid(plane))
-    local = patches.low[plane] + (cell + 0.5) * patches.cell
-    return local @ patches.axes[plane] + planes.offsets[plane] * planes.normals[plane]
 
 
 def consolidated(surfaces: Surfaces, means: Tensor) -> Surfaces:
@@ -52,10 +30,9 @@ def consolidated(surfaces: Surfaces, means: Tensor) -> Surfaces:
     planes, patches = surfaces.planes, surfaces.patches
     if not len(planes):
         return surfaces
-    points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
-    areas, whole, walls = patches.areas, torch.arange(len(planes)), large_planes(patches)
+    points, areas, whole = surface_points(planes, patches), patches.areas, torch.arange(len(planes))
     for large in areas.argsort(descending=True, stable=True).tolist():
-        if not bool(walls[large]) or int(whole[large]) != large:
+        if not bool(patches.large[large]) or int(whole[large]) != large:
             continue
         normal, offset = planes.normals[large], planes.offsets[large]
         for piece in range(len(planes)):
@@ -65,206 +42,11 @@ def consolidated(surfaces: Surfaces, means: Tensor) -> Surfaces:
                 continue
             height = points[piece] @ normal - offset
             if float(height.abs().median()) < PIECE_DISTANCE:
-                points[large] = torch.cat((points[large], points[piece] - height[:, None] * normal))
+                points[large] = torch.cat((points[large], points[piece]))
                 points[piece], whole[piece] = points[piece][:0], large
     plane_of = torch.where(surfaces.plane_of >= 0, whole[surfaces.plane_of.clamp_min(0)], -1)
     joined = replace(surfaces, patches=Patches.of(planes, points, patches.cell), plane_of=plane_of)
     return replace(joined, plane_of=with_skins(joined, means))
-
-
-def with_both_faces(surfaces: Surfaces, obstacles: Obstacles) -> Surfaces:
-    """The surfaces with the two faces of boards apart, each facing outwards.
-
-    What is a decimetre thick comes out of photographs as one plane in its middle, or as two that face the same way, and
-    the image in a mirror that stands 6 cm off is 12 cm off. Gaussians before and behind a small plane, up to 15 cm, are
-    of two faces where their heights fall into two, 5 cm apart and 3.5 median deviations of either, and half of one
-    face has the other one across. Those behind become a plane of their own that faces the other way; both stand where
-    their Gaussians do. Planes keep their numbers, new ones follow.
-    """
-    planes, patches, plane_of = surfaces.planes, surfaces.patches, surfaces.plane_of.clone()
-    points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
-    normals, offsets = list(planes.normals), list(planes.offsets)
-    large = torch.cat((large_planes(patches), torch.zeros(1, dtype=torch.bool)))  # the last for the label -1
-    free = (obstacles.opacities >= obstacles.min_opacity) & ~large[plane_of]
-    for plane in range(len(planes)):
-        if bool(large[plane]) or not len(points[plane]):
-            continue
-        near = (obstacles.means @ normals[plane] - offsets[plane]).abs() < DEEPEST / 2
-        near &= free & ((surfaces.normals @ normals[plane]).abs() > SKIN_ANGLE)
-        own = torch.nonzero(near).squeeze(-1)
-        own = own[patches.holds(obstacles.means[own], torch.full_like(own, plane))]
-        height = obstacles.means[own] @ normals[plane]
-        behind = _lower(height)
-        if behind is None:
-            continue
-        faces = [_beside(points[plane], obstacles.means[own[side]], patches.cell) for side in (~behind, behind)]
-        if int((faces[0] & faces[1]).sum()) < HALF * min(int(face.sum()) for face in faces):
-            continue
-        plane_of[own] = torch.where(behind, len(normals), plane)
-        offsets[plane] = height[~behind].median()
-        offsets.append(-height[behind].median())
-        normals.append(-normals[plane])
-        points.append(points[plane][faces[1]])
-        points[plane] = points[plane][faces[0]]
-    _turn_outwards(normals, offsets, points, large[:-1], patches.cell)
-    both = Planes(torch.stack(normals), torch.stack(offsets)) if normals else planes
-    flat = [
-        part - (part @ both.normals[at] - both.offsets[at])[:, None] * both.normals[at]
-        for at, part in enumerate(points)
-    ]
-    return replace(surfaces, planes=both, patches=Patches.of(both, flat, patches.cell), plane_of=plane_of)
-
-
-def _turn_outwards(
-    normals: list[Tensor], offsets: list[Tensor], points: Sequence[Tensor], large: Tensor, cell: float
-) -> None:
-    """Turn those of the planes that are not `large` `[plane]` which lie behind such another and face the same way."""
-    for plane in range(len(large)):
-        for other in range(len(large)):
-            behind = float(offsets[other] - offsets[plane])
-            small = len(points[plane]) and not bool(large[plane] | large[other])
-            if not small or not BESIDE < behind < DEEPEST or float(normals[plane] @ normals[other]) < PIECE_ANGLE:
-                continue
-            across = _beside(points[plane], points[other] - behind * normals[other], cell)
-            if float(across.float().mean()) > HALF:
-                normals[plane], offsets[plane] = -normals[plane], -offsets[plane]
-                break
-
-
-def _lower(height: Tensor) -> Tensor | None:
-    """Which of `height` `[n]` [m] are of the lower of two faces; None where there is one, or too few to tell."""
-    if len(height) < 2 * FEWEST:
-        return None
-    ordered = height.double().sort().values
-    count = torch.arange(1, len(ordered))
-    below, total = ordered.cumsum(0)[:-1], ordered.sum()
-    between = count * (len(ordered) - count) * (below / count - (total - below) / (len(ordered) - count)).square()
-    at = int(between[FEWEST - 1 : len(between) - FEWEST + 1].argmax()) + FEWEST  # Otsu's threshold
-    low, high = ordered[:at], ordered[at:]
-    spread = max(float((part - part.median()).abs().median()) for part in (low, high))
-    apart = float(high.median() - low.median())
-    return height <= ordered[at - 1] if apart > max(THIN, APART * spread) else None
-
-
-def _beside(cells: Tensor, points: Tensor, cell: float) -> Tensor:
-    """Which middles of `cells` `[n, 3]` [m] have one of `points` `[m, 3]` within two widths of a `cell` [m]."""
-    return torch.cdist(cells, points).amin(1) < 2 * cell if len(points) else torch.zeros(len(cells), dtype=torch.bool)
-
-
-def flat_pieces(surfaces: Surfaces, obstacles: Obstacles) -> Surfaces:
-    """The surfaces whose small planes are without pieces that are round or stand beside the others.
-
-    A column's front lies within centimetres of a board's far behind it, and passes for more of the same plane. A piece
-    is what hangs together but for gaps of a cell. It goes if its Gaussians, by a parabola through their heights over
-    the plane, bend with a radius under 1.7 m and by 1.5 cm, or if their median is 3 cm off that of the largest piece
-    which does not; where the plane itself lies is not asked.
-    """
-    planes, patches, plane_of = surfaces.planes, surfaces.patches, surfaces.plane_of.clone()
-    points, large = [], large_planes(patches).tolist()
-    for plane in range(len(planes)):
-        middles, grid = surface_points(planes, patches, plane), patches.grid(plane)
-        own = torch.nonzero((plane_of == plane) & (obstacles.opacities >= obstacles.min_opacity)).squeeze(-1)
-        if not large[plane] and len(own):
-            means = obstacles.means[own]
-            pieces = torch.zeros(grid.shape, dtype=torch.int32)
-            label(widened(grid, 1).numpy(), [[1] * 3] * 3, output=pieces.numpy())
-            row, column = patches.cell_of(means, torch.full_like(own, plane)).unbind(-1)
-            piece_of = pieces[row.clamp(0, len(grid) - 1), column.clamp(0, grid.shape[1] - 1)]
-            gone = _not_flat(means @ patches.axes[plane].mT, means @ planes.normals[plane], piece_of)
-            plane_of[own[torch.isin(piece_of, gone)]] = -1
-            middles = middles[~torch.isin(pieces[grid], gone)]
-        points.append(middles)
-    return replace(surfaces, patches=Patches.of(planes, points, patches.cell), plane_of=plane_of)
-
-
-def _not_flat(place: Tensor, height: Tensor, piece_of: Tensor) -> Tensor:
-    """The pieces of a plane that are not flat parts of it, by Gaussians at `place` `[n, 2]`, `height` `[n]` [m] in
-    pieces `piece_of` `[n]`, 0 for none. Of few Gaussians nothing is said."""
-    numbers, counts = piece_of[piece_of > 0].unique(return_counts=True)
-    told = numbers[counts >= FEWEST][counts[counts >= FEWEST].argsort(descending=True, stable=True)]
-    gone, level = [], None
-    for piece in told.tolist():
-        inside = piece_of == piece
-        median = float(height[inside].median())
-        bad = _is_narrow(place[inside]) or _is_round(place[inside], height[inside])
-        if bad or (level is not None and abs(median - level) > BESIDE):
-            gone.append(piece)
-        elif level is None:
-            level = median
-    return torch.tensor(gone, dtype=piece_of.dtype)
-
-
-def _is_narrow(place: Tensor) -> bool:
-    """Whether Gaussians at `place` `[n, 2]` [m] stand in a strip: most of them within `NARROW` of its middle."""
-    return bool(((place - place.median(0).values).abs().quantile(0.8, 0) < NARROW).any())
-
-
-def _is_round(place: Tensor, height: Tensor) -> bool:
-    """Whether Gaussians at `place` `[n, 2]`, `height` `[n]` [m] over a plane lie on a thing round along either axis."""
-    u, v = (place - place.median(0).values).double().unbind(-1)
-    terms = torch.stack((torch.ones_like(u), u, v, u * u, u * v, v * v), -1)
-    found = torch.linalg.lstsq(terms, height.double()[:, None], driver="gelsd").solution[:, 0]
-    bend = 2 * found[[3, 5]].abs()
-    half = torch.stack((u.abs().quantile(0.8), v.abs().quantile(0.8)))
-    return bool(((bend > BENT) & (0.5 * bend * half.square() > BOW)).any())
-
-
-def outlined(planes: Planes, patches: Patches, obstacles: Obstacles) -> Patches:
-    """The patches without cells at the outlines of small planes through whose middle Gaussians let pass over `SOLID`.
-
-    Cells are found by what a Gaussian may cover, so that surface has no gaps; outlines then lie up to two cells
-    outside. That matters where a way passes beside a thing; large planes end at others. Surface far from where
-    Gaussians stand, as that of mirrors which photographs did not show, stays. Holes of large planes under a square
-    metre are closed: no door is so small, and behind boxes photographs and echoes leave such ones.
-    """
-    from scipy.ndimage import binary_fill_holes
-
-    points, large = [], large_planes(patches).tolist()
-    for plane in range(len(planes)):
-        if large[plane]:
-            grid = patches.grid(plane)
-            holes = torch.zeros(grid.shape, dtype=torch.int32)
-            label((torch.from_numpy(binary_fill_holes(grid.numpy())) & ~grid).numpy(), output=holes.numpy())
-            small = torch.bincount(holes.flatten()) * patches.cell**2 < HOLE
-            small[0] = False
-            middles = patches.low[plane] + (torch.nonzero(grid | small[holes]) + 0.5) * patches.cell
-            points.append(middles @ patches.axes[plane] + planes.offsets[plane] * planes.normals[plane])
-            continue
-        middles, through = surface_points(planes, patches, plane), THROUGH * planes.normals[plane]
-        kept = patches.grid(plane)
-        solid = torch.zeros_like(kept)
-        solid[kept] = obstacles.transmittance(middles - through, middles + through, stop_short=0.0) < SOLID
-        spilled = ~solid & widened(solid, OUTSIDE)
-        for _ in range(OUTSIDE):
-            kept = kept & ~(spilled & rim(closed(kept)))
-        points.append(middles[kept[patches.grid(plane)]])
-    return Patches.of(planes, points, patches.cell)
-
-
-def standing(planes: Planes, patches: Patches) -> Patches:
-    """The patches with small planes down to the floor, or up to any large plane that they nearly reach.
-
-    In the edge between two surfaces photographs show neither well, and echoes are of both; what ends `FOOT` before a
-    large plane's surface mostly stands on it. A board and the floor mirror together right there.
-    """
-    points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
-    large = large_planes(patches)
-    grounds = torch.nonzero(large).squeeze(-1).tolist()
-    steps = torch.arange(0.0, 1.5 * FOOT, patches.cell)
-    for plane in torch.nonzero(~large).squeeze(-1).tolist():
-        cells, normal = points[plane], planes.normals[plane]
-        for ground in grounds:
-            slope = planes.normals[ground] - (planes.normals[ground] @ normal) * normal
-            if not len(cells) or float(slope @ slope) < STEEP:
-                continue
-            height = cells @ planes.normals[ground] - planes.offsets[ground]
-            near = torch.nonzero(height.abs() < FOOT).squeeze(-1)
-            near = near[patches.holds(cells[near], torch.full_like(near, ground))]
-            way = height[near] / (slope @ slope)
-            along = steps[:, None] * way.sign() * slope.norm().reciprocal()
-            added = cells[near] - along[..., None] * slope
-            points[plane] = torch.cat((points[plane], added[along.abs() < way.abs()]))
-    return Patches.of(planes, points, patches.cell)
 
 
 def with_skins(surfaces: Surfaces, means: Tensor) -> Tensor:
@@ -272,9 +54,9 @@ def with_skins(surfaces: Surfaces, means: Tensor) -> Tensor:
 
     Near is within 30 cm and 45 degrees, before or behind its surface.
     """
-    labels, large = surfaces.plane_of.clone(), large_planes(surfaces.patches)
+    labels = surfaces.plane_of.clone()
     for plane in surfaces.patches.areas.argsort(descending=True, stable=True).tolist():
-        if not bool(large[plane]):
+        if not bool(surfaces.patches.large[plane]):
             continue
         normal = surfaces.planes.normals[plane]
         height = (means @ normal - surfaces.planes.offsets[plane]).abs()
@@ -295,10 +77,10 @@ def squared(surfaces: Surfaces) -> Surfaces:
     """
     planes, patches = surfaces.planes, surfaces.patches
     areas, normals, offsets = patches.areas, planes.normals.clone(), planes.offsets.clone()
-    points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
-    walls, whole = large_normals(planes, patches), torch.arange(len(planes))
-    large = large_planes(patches).tolist()
-    small = [p for p in areas.argsort(descending=True, stable=True).tolist() if float(areas[p]) > 0 and not large[p]]
+    points, large = surface_points(planes, patches), patches.large
+    walls, whole = planes.normals[large], torch.arange(len(planes))
+    order = areas.argsort(descending=True, stable=True)
+    small = order[(areas[order] > 0) & ~large[order]].tolist()
     if not len(walls):
         return surfaces
     done: list[int] = []
@@ -318,30 +100,20 @@ def squared(surfaces: Surfaces) -> Surfaces:
         else:
             done.append(plane)
     planes = Planes(normals, offsets)
-    flat = [
-        part - (part @ normals[plane] - offsets[plane])[:, None] * normals[plane] for plane, part in enumerate(points)
-    ]
     plane_of = torch.where(surfaces.plane_of >= 0, whole[surfaces.plane_of.clamp_min(0)], -1)
-    return replace(surfaces, planes=planes, patches=Patches.of(planes, flat, patches.cell), plane_of=plane_of)
+    return replace(surfaces, planes=planes, patches=Patches.of(planes, points, patches.cell), plane_of=plane_of)
 
 
-def large_normals(planes: Planes, patches: Patches) -> Tensor:
-    """Normals `[wall, 3]` of the large planes, along which most of what people build stands."""
-    return planes.normals[large_planes(patches)]
+def walls_whole(patches: Patches) -> Patches:
+    """The patches with holes of large planes under a square metre closed.
 
-
-def large_planes(patches: Patches) -> Tensor:
-    """Which planes `[P]` have 5 m^2 of surface in one piece, gaps of some cells aside.
-
-    Tops of a table and of benches, however many, are no wall.
+    No door is so small, and behind boxes photographs and echoes leave such ones.
     """
-    large = patches.areas >= LARGE
-    for plane in torch.nonzero(large).squeeze(-1).tolist():
-        grid = patches.grid(plane)
-        pieces = torch.zeros(grid.shape, dtype=torch.int32)
-        label(widened(grid, HANGS).numpy(), [[1] * 3] * 3, output=pieces.numpy())
-        large[plane] = float(torch.bincount(pieces[grid]).max()) * patches.cell**2 >= LARGE
-    return large
+    whole = replace(patches, cells=patches.cells.clone())
+    for plane in torch.nonzero(patches.large).squeeze(-1).tolist():
+        grid = whole.grid(plane)
+        grid |= without_holes(grid, round(HOLE / patches.cell**2))
+    return whole
 
 
 def oblique_planes(planes: Planes, patches: Patches) -> Tensor:
@@ -349,7 +121,7 @@ def oblique_planes(planes: Planes, patches: Patches) -> Tensor:
 
     Photographs make some where none is.
     """
-    walls = large_normals(planes, patches)
+    walls = planes.normals[patches.large]
     if not len(walls):
         return torch.zeros(len(planes), dtype=torch.bool)
     return ((planes.normals @ walls.mT).abs() < SQUARE_ANGLE).all(-1)

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.geometry import Patches, Planes
-from rf3dgs.geometry.patches import plane_axes
-from rf3dgs.training.consolidation import surface_points
+from rf3dgs.geometry.patches import plane_axes, surface_points
 from rf3dgs.training.echoes import Echoes
 
 REACH = 0.3  # echoes this far off a plane are asked about it [m]
@@ -166,8 +165,7 @@ def _opened(planes: Planes, seen: Patches, whole: Patches, echoes: Echoes) -> Pa
     """The patches `whole` without the cells that three legs or more crossed and that have no echo, as `seen` tells."""
     start, end = legs_of(echoes)
     points = []
-    for plane in range(len(planes)):
-        cells = surface_points(planes, whole, plane)
+    for plane, cells in enumerate(surface_points(planes, whole)):
         normal, offset = planes.normals[plane], planes.offsets[plane]
         before, after = start @ normal - offset, end @ normal - offset
         cross = (before * after < 0) & (torch.minimum(before.abs(), after.abs()) > REACH)
@@ -237,7 +235,7 @@ def in_free_space(points: Tensor, echoes: Echoes) -> Tensor:
 
 def cells_of(planes: Planes, patches: Patches) -> tuple[Tensor, Tensor]:
     """The middles `[cell, 3]` [m] of all cells that are surface, and the plane `[cell]` of each."""
-    points = [surface_points(planes, patches, plane) for plane in range(len(planes))]
+    points = surface_points(planes, patches)
     if not points:
         return torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)
     return torch.cat(points), torch.repeat_interleave(torch.arange(len(points)), torch.tensor([*map(len, points)]))

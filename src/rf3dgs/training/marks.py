@@ -12,9 +12,9 @@ from torch import Tensor
 
 from rf3dgs.field.sources import Marks
 from rf3dgs.geometry import Patches, Planes
+from rf3dgs.geometry.patches import surface_points
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import C0
-from rf3dgs.training.consolidation import surface_points
 from rf3dgs.training.reflection import Glints, law_levels
 
 ALIKE = ((0.3, 0.0), (0.8, 0.0), (2.0, 0.2))  # widths [m] and differences of colour that are tried; 0: any colour
@@ -106,9 +106,9 @@ def fit_marks(
     peaks = _peaks(found, miss, worth)
     features = _features(peaks.point, peaks.plane, spread, paint)
     share, _ = _explained(peaks, features)
-    parts = []
+    parts, surface = [], surface_points(planes, patches)
     for number in torch.nonzero(worth).squeeze(-1).tolist():
-        places, own = _lattice(planes, patches, number), peaks.plane == number
+        places, own = _lattice(surface[number], patches.axes[number]), peaks.plane == number
         here = _features(places, torch.full((len(places),), number), spread, paint)
         level_db = _alike(here, features[own]) @ share[peaks.peak[own]]
         loud = level_db.abs() > LEAST_DB  # and what is beside it, so that it ends there
@@ -157,9 +157,8 @@ def _explained(peaks: _Peaks, features: Tensor) -> tuple[Tensor, Tensor]:
     return share, others
 
 
-def _lattice(planes: Planes, patches: Patches, plane: int) -> Tensor:
-    """Places `[n, 3]` [m] all over the surface of a plane, `LATTICE` apart."""
-    cells = surface_points(planes, patches, plane)
-    _, place = torch.unique((cells @ patches.axes[plane].mT / LATTICE).floor().long(), dim=0, return_inverse=True)
+def _lattice(cells: Tensor, axes: Tensor) -> Tensor:
+    """Places `[n, 3]` [m] all over `cells` `[cell, 3]` [m] of a plane, `LATTICE` apart along its `axes` `[2, 3]`."""
+    _, place = torch.unique((cells @ axes.mT / LATTICE).floor().long(), dim=0, return_inverse=True)
     size = torch.bincount(place)
     return torch.zeros(len(size), 3).index_add_(0, place, cells) / size[:, None]

@@ -12,12 +12,12 @@ from rf3dgs.field.rays import Rays
 from rf3dgs.field.sources import PointSources
 from rf3dgs.field.transmitter import estimate_transmitter
 from rf3dgs.geometry import Patches, Planes, SurfaceConfig, find_surfaces, flattened
-from rf3dgs.geometry.patches import CELL, plane_axes
+from rf3dgs.geometry.patches import CELL, plane_axes, surface_points
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.splats.surface import ALONG
-from rf3dgs.training.consolidation import PIECE_ANGLE, PIECE_DISTANCE, consolidated, surface_points
+from rf3dgs.training.consolidation import PIECE_ANGLE, PIECE_DISTANCE, consolidated
 from rf3dgs.training.echo_planes import (
     LEAST_WITNESSES,
     REGION,
@@ -124,8 +124,7 @@ def _onto_known(walls: Planes, extents: Patches, planes: Planes, areas: Tensor) 
     several planes a wall lies on the largest.
     """
     normals, offsets = walls.normals.clone(), walls.offsets.clone()
-    for wall in range(len(walls)):
-        cells = surface_points(walls, extents, wall)
+    for wall, cells in enumerate(surface_points(walls, extents)):
         if not len(cells):
             continue
         alike = torch.nonzero((planes.normals @ walls.normals[wall]).abs() > PIECE_ANGLE).squeeze(-1)
@@ -173,10 +172,7 @@ def _with_planes(planes: Planes, patches: Patches, spots: Spots, echoes: Echoes)
 
 def _moved(patches: Patches, before: Planes, after: Planes) -> Patches:
     """The patches of planes that were moved: each cell goes along the new normal."""
-    cells, plane = cells_of(before, patches)
-    height = (cells * after.normals[plane]).sum(-1) - after.offsets[plane]
-    cells = cells - height[:, None] * after.normals[plane]
-    return Patches.of(after, [cells[plane == number] for number in range(len(after))], patches.cell)
+    return Patches.of(after, surface_points(before, patches), patches.cell)
 
 
 def _flat(points: Tensor, normals: Tensor, spacing: float) -> Gaussians:

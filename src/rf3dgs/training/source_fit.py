@@ -16,20 +16,11 @@ from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
-from rf3dgs.training.consolidation import (
-    consolidated,
-    flat_pieces,
-    large_normals,
-    oblique_planes,
-    outlined,
-    squared,
-    standing,
-    with_both_faces,
-    with_skins,
-)
+from rf3dgs.training.consolidation import consolidated, oblique_planes, squared, walls_whole, with_skins
 from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
 from rf3dgs.training.marks import Paint, fit_marks
 from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_reflection, glints, silent_planes, silent_sources
+from rf3dgs.training.small_planes import flat_pieces, outlined, standing, with_both_faces
 from rf3dgs.training.timed_mirrors import timed_mirrors, with_timed
 from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, refined_planes, with_mirrors
 
@@ -89,7 +80,7 @@ def fit_sources(
     surfaces = with_both_faces(consolidated(surfaces, obstacles.means), obstacles)
     obstacles = replace(obstacles, labels=surfaces.plane_of)
     sources = _known(direct, surfaces)
-    walls = large_normals(surfaces.planes, surfaces.patches)
+    walls = surfaces.planes.normals[surfaces.patches.large]
     timed = timed_mirrors(spectra, tx.position, walls) if config.complete else []
     if timed:
         sources, surfaces, obstacles = _over(sources, with_timed(sources, timed), surfaces, obstacles)
@@ -111,8 +102,8 @@ def fit_sources(
             sources = with_images(sources, probes, replace(config, order=1))
             sources = _refined(sources, seen, peaks, positions, obstacles, config)
     assert sources.patches is not None
-    outlines = outlined(sources.planes, sources.patches, obstacles)
-    sources = replace(sources, patches=standing(sources.planes, outlines))
+    patches = outlined(sources.planes, walls_whole(sources.patches), obstacles)
+    sources = replace(sources, patches=standing(sources.planes, patches))
     sources = _gated(sources, spectra, seen, obstacles)
     obstacles = cleared_by(sources, spectra, seen, obstacles)
     rays = sources.rays_each(positions, obstacles, in_sight=seen)

@@ -162,9 +162,8 @@ class Surfaces:
     @classmethod
     def joined(cls, parts: Sequence["Surfaces"]) -> "Surfaces":
         """All of some parts, one after another."""
-        none = torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0)
-        columns = zip(none, *((p.points, p.normals, p.colours, p.areas) for p in parts), strict=True)
-        return cls(*(torch.cat(column) for column in columns))
+        none = cls(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
+        return cls(*(torch.cat([getattr(part, field.name) for part in (none, *parts)]) for field in fields(cls)))
 
     def only(self, chosen: Tensor) -> "Surfaces":
         """Some of them, by a mask or list."""

@@ -17,9 +17,9 @@ from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.field.images import image_chain, sequences
 from rf3dgs.field.sources import PointSources
 from rf3dgs.geometry import Patches, Planes
+from rf3dgs.geometry.patches import surface_points
 from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Spectrum
-from rf3dgs.training.consolidation import large_planes, surface_points
 from rf3dgs.training.line_of_sight import standing_out
 from rf3dgs.training.virtual import DISC, NEAREST_IMAGE, PEAKS, Mirror, discs
 
@@ -92,8 +92,8 @@ def with_timed(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, Pa
     """
     assert sources.patches is not None
     normals, offsets = list(sources.planes.normals), list(sources.planes.offsets)
-    points = [surface_points(sources.planes, sources.patches, plane) for plane in range(len(sources.planes))]
-    areas, large = sources.patches.areas, large_planes(sources.patches).tolist()
+    points = surface_points(sources.planes, sources.patches)
+    areas, large = sources.patches.areas, sources.patches.large.tolist()
     taken: set[int] = set()
     for mirror in mirrors:
         middle = mirror.points.median(0).values
@@ -123,10 +123,7 @@ def with_timed(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, Pa
         reaches = DISC if wide else narrow
         points[plane] = torch.cat((points[plane], discs(mirror, sources.patches, plane, reaches)))
     planes = Planes(torch.stack(normals), torch.stack(offsets))
-    flat = [
-        part - (part @ n - o)[:, None] * n for part, n, o in zip(points, planes.normals, planes.offsets, strict=True)
-    ]
-    return planes, Patches.of(planes, flat, sources.patches.cell)
+    return planes, Patches.of(planes, points, sources.patches.cell)
 
 
 def _is_image_of_image(image: Tensor, tx: Tensor, mirrors: list[Mirror]) -> bool:

@@ -16,11 +16,11 @@ from rf3dgs.field.rays import Rays
 from rf3dgs.field.sources import PointSources
 from rf3dgs.field.transmitter import bearing_error, closest_point, pairwise_meetings, pixel_of
 from rf3dgs.geometry import Patches, Planes
+from rf3dgs.geometry.patches import surface_points
 from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
-from rf3dgs.training.consolidation import large_planes, surface_points
 from rf3dgs.training.line_of_sight import SEEN_OVER_RING, standing_out
 
 PEAKS = 16
@@ -176,7 +176,7 @@ def find_mirrors(
 def _of_one_reflection(mirrors: list[Mirror], sources: PointSources) -> list[Mirror]:
     """The mirrors whose images are not images of images in the others and the large planes; weak ones go first."""
     kept = list(mirrors)
-    large = torch.zeros(0, dtype=torch.bool) if sources.patches is None else large_planes(sources.patches)
+    large = torch.zeros(0, dtype=torch.bool) if sources.patches is None else sources.patches.large
     for mirror in reversed(mirrors):
         others = [one for one in kept if one is not mirror]
         normals = torch.cat((sources.planes.normals[large], *(one.normal[None] for one in others)))
@@ -242,7 +242,7 @@ def with_mirrors(sources: PointSources, mirrors: list[Mirror]) -> tuple[Planes, 
     """
     assert sources.patches is not None
     normals, offsets = list(sources.planes.normals), list(sources.planes.offsets)
-    points = [surface_points(sources.planes, sources.patches, plane) for plane in range(len(sources.planes))]
+    points = surface_points(sources.planes, sources.patches)
     for mirror in mirrors:
         middle = mirror.points.mean(0)
         for plane, (normal, offset) in enumerate(zip(normals, offsets, strict=True)):

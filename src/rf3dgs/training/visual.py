@@ -84,6 +84,7 @@ class VisualStage:
         self.config, self.schedule = config, Schedule.of(config)
         self.cameras = [photo.camera for photo in photos]
         self.pictures = [picture_of(photo) for photo in photos]
+        self.box = config.bounds or camera_box(self.cameras)
         self.extent = scene_extent(torch.stack([camera.position for camera in self.cameras]))
         self.initial = initial
         first = initial.tensors().values() if isinstance(initial, Gaussians) else [] if initial is None else [initial]
@@ -118,7 +119,7 @@ class VisualStage:
         if initial is not None:
             initial.check()
             return initial
-        low, high = self.config.bounds or camera_box(self.cameras)
+        low, high = self.box
         count, seed = self.config.start_count, self.config.seed
         if self.config.start == "random":
             return random_start(self.cameras, count, low, high, degree=degree, seed=seed)
@@ -215,8 +216,7 @@ class VisualStage:
     def _add_missing(self, trainer: Trainer, iteration: int) -> None:
         """Add Gaussians on small things that photographs show and the present Gaussians lack, on no plane so far."""
         config, now = self.config, trainer.gaussians().detach()
-        low, high = config.bounds or camera_box(self.cameras)
-        far = farthest(self.cameras, low, high)
+        far = farthest(self.cameras, *self.box)
         found = missing_surfaces(now, self.cameras, self.pictures, far, config.backend)
         room = min(config.max_count - len(now), round(len(found.points) / PHOTOS_OF_A_THING))
         if room < 2:
