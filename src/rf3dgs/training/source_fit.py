@@ -22,7 +22,7 @@ from rf3dgs.training.marks import Paint, fit_marks
 from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_reflection, glints, silent_planes, silent_sources
 from rf3dgs.training.small_planes import flat_pieces, outlined, standing, with_both_faces
 from rf3dgs.training.timed_mirrors import timed_mirrors, with_timed
-from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, refined_planes, with_mirrors
+from rf3dgs.training.virtual import completed, find_mirrors, peaks_of, refined_planes, with_mirrors
 
 PROBES = 150
 PROBE_MARGIN = 0.5
@@ -77,58 +77,113 @@ def fit_sources(
         obstacles = replace(obstacles, labels=None).cleared(tx.position.expand_as(positions), positions, seen)
         return SourceFit(direct, seen, direct.rays_each(positions, obstacles, in_sight=seen), obstacles)
     probes = torch.cat((positions, _probes(positions, config.seed)))
+    site, timed = _placed(direct, surfaces, obstacles, spectra, config)
+    site = replace(site, sources=with_images(site.sources, probes, replace(config, order=1)))
+    by_bearings = replace(config, complete=config.complete and not timed)
+    if by_bearings.refine or by_bearings.complete:
+        site = _told_by_bearings(site, spectra, seen, probes, by_bearings)
+    site = _opened(site, spectra, seen)
+    paint = None if geometry is None else Paint.of(geometry, site.surfaces.plane_of)
+    sources, found = _levelled(site, spectra, seen, probes, paint, config)
+    if config.order > TOLD_BY:
+        sources = with_images(sources, probes, config)
+    sources = _strongest(sources, probes, site.obstacles, spectra, config)
+    looked = glints(sources, sources.rays_each(positions, site.obstacles, in_sight=seen), spectra)
+    dark = silent_sources(looked, sources.reflection, sources.order)
+    sources = replace(sources, sequence=sources.sequence[~dark])
+    return SourceFit(sources, seen, sources.rays_each(positions, site.obstacles, in_sight=seen), site.obstacles, found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Site:
+    """Point sources over the planes of the surfaces, and the obstacles, whose labels are the planes' numbers."""
+
+    sources: PointSources
+    surfaces: Surfaces
+    obstacles: Obstacles
+
+    @classmethod
+    def of(cls, sources: PointSources, surfaces: Surfaces, obstacles: Obstacles) -> "_Site":
+        """All three over the planes of the surfaces."""
+        sources = replace(sources, planes=surfaces.planes, patches=surfaces.patches)
+        return cls(sources, surfaces, replace(obstacles, labels=surfaces.plane_of))
+
+    def over(self, planes: Planes, patches: Patches) -> "_Site":
+        """The site over planes that were found; Gaussians near large ones become theirs."""
+        surfaces = replace(self.surfaces, planes=planes, patches=patches)
+        surfaces = replace(surfaces, plane_of=with_skins(surfaces, self.obstacles.means))
+        return self.of(completed(self.sources, planes, patches), surfaces, self.obstacles)
+
+
+def _placed(
+    direct: PointSources, surfaces: Surfaces, obstacles: Obstacles, spectra: Spectrum, config: SourceConfig
+) -> tuple[_Site, bool]:
+    """The transmitter among planes that are whole, square and where delays put them; and whether any delay did.
+
+    Planes reflect as dielectrics do, so far.
+    """
     surfaces = with_both_faces(consolidated(surfaces, obstacles.means), obstacles)
-    obstacles = replace(obstacles, labels=surfaces.plane_of)
-    sources = _known(direct, surfaces)
+    reflection = torch.tensor(DIELECTRIC).expand(len(surfaces.planes), 3)
+    known = replace(direct, planes=surfaces.planes, patches=surfaces.patches, reflection=reflection)
+    site = _Site.of(known, surfaces, obstacles)
     walls = surfaces.planes.normals[surfaces.patches.large]
-    timed = timed_mirrors(spectra, tx.position, walls) if config.complete else []
+    timed = timed_mirrors(spectra, direct.tx, walls) if config.complete else []
     if timed:
-        sources, surfaces, obstacles = _over(sources, with_timed(sources, timed), surfaces, obstacles)
-    if config.square:
-        surfaces = squared(surfaces)
-    surfaces = flat_pieces(surfaces, obstacles)
-    obstacles = replace(obstacles, labels=surfaces.plane_of)
-    sources = replace(sources, planes=surfaces.planes, patches=surfaces.patches)
-    sources = with_images(sources, probes, replace(config, order=1))
-    peaks = peaks_of(spectra) if config.refine or config.complete else None
-    if peaks is not None and config.refine:
-        sources = _refined(sources, seen, peaks, positions, obstacles, config)
-    if peaks is not None and config.complete and not timed:
-        every = _fitted(sources, spectra, seen, obstacles)
-        every = with_images(every, probes, config)
-        mirrors = find_mirrors(every, every.rays_each(positions, obstacles, in_sight=seen), peaks, spectra, obstacles)
-        if mirrors:
-            sources, surfaces, obstacles = _over(sources, with_mirrors(sources, mirrors), surfaces, obstacles)
-            sources = with_images(sources, probes, replace(config, order=1))
-            sources = _refined(sources, seen, peaks, positions, obstacles, config)
-    assert sources.patches is not None
-    patches = outlined(sources.planes, walls_whole(sources.patches), obstacles)
-    sources = replace(sources, patches=standing(sources.planes, patches))
-    sources = _gated(sources, spectra, seen, obstacles)
-    obstacles = cleared_by(sources, spectra, seen, obstacles)
-    rays = sources.rays_each(positions, obstacles, in_sight=seen)
-    found = glints(sources, rays, spectra)
+        site = site.over(*with_timed(site.sources, timed))
+    surfaces = squared(site.surfaces) if config.square else site.surfaces
+    return _Site.of(site.sources, flat_pieces(surfaces, site.obstacles), site.obstacles), bool(timed)
+
+
+def _told_by_bearings(site: _Site, spectra: Spectrum, seen: Tensor, probes: Tensor, config: SourceConfig) -> _Site:
+    """The site with its planes where peaks have their images, and with mirrors that peaks without one point to."""
+    positions, peaks = spectra.pose.position, peaks_of(spectra)
+
+    def refined(site: _Site) -> _Site:
+        rays = site.sources.rays_each(positions, site.obstacles, in_sight=seen)
+        return replace(
+            site, sources=replace(site.sources, planes=refined_planes(site.sources, rays, peaks, positions, config))
+        )
+
+    if config.refine:
+        site = refined(site)
+    if not config.complete:
+        return site
+    every = with_images(_fitted(site.sources, spectra, seen, site.obstacles), probes, config)
+    rays = every.rays_each(positions, site.obstacles, in_sight=seen)
+    mirrors = find_mirrors(every, rays, peaks, spectra, site.obstacles)
+    if not mirrors:
+        return site
+    site = site.over(*with_mirrors(site.sources, mirrors))
+    site = replace(site, sources=with_images(site.sources, probes, replace(config, order=1)))
+    return refined(site)
+
+
+def _opened(site: _Site, spectra: Spectrum, seen: Tensor) -> _Site:
+    """The site with outlines of things, the gate, and without what stands in ways that were seen to be open."""
+    sources, patches = site.sources, site.sources.patches
+    assert patches is not None
+    patches = standing(sources.planes, outlined(sources.planes, walls_whole(patches), site.obstacles))
+    sources = _gated(replace(sources, patches=patches), spectra, seen, site.obstacles)
+    return replace(site, sources=sources, obstacles=cleared_by(sources, spectra, seen, site.obstacles))
+
+
+def _levelled(
+    site: _Site, spectra: Spectrum, seen: Tensor, probes: Tensor, paint: Paint | None, config: SourceConfig
+) -> tuple[PointSources, Glints]:
+    """The sources of the orders that tell levels, with what planes reflect and their marks; and what was seen there."""
+    sources, positions = site.sources, spectra.pose.position
+    found = glints(sources, sources.rays_each(positions, site.obstacles, in_sight=seen), spectra)
     sources = replace(sources, reflection=fit_reflection(found, len(sources.planes)))
     assert sources.patches is not None
     silent = silent_planes(found, len(sources.planes), oblique_planes(sources.planes, sources.patches))
     sources = with_images(sources, probes, replace(config, order=min(config.order, TOLD_BY)), silent=silent)
-    rays = sources.rays_each(positions, obstacles, in_sight=seen)
-    found = glints(sources, rays, spectra)
+    found = glints(sources, sources.rays_each(positions, site.obstacles, in_sight=seen), spectra)
     dark = silent_sources(found, sources.reflection, sources.order)
     found = found.only(~dark[found.source])
     reflection = fit_reflection(found, len(sources.planes))
-    paint = None if geometry is None else Paint.of(geometry, surfaces.plane_of)
     assert sources.patches is not None
     marks = fit_marks(found, reflection, sources.planes, sources.patches, paint)
-    sources = replace(sources, reflection=reflection, marks=marks)
-    if config.order > TOLD_BY:
-        sources = with_images(sources, probes, config)
-    sources = _strongest(sources, probes, obstacles, spectra, config)
-    looked = glints(sources, sources.rays_each(positions, obstacles, in_sight=seen), spectra)
-    dark = silent_sources(looked, sources.reflection, sources.order)
-    sources = replace(sources, sequence=sources.sequence[~dark])
-    rays = sources.rays_each(positions, obstacles, in_sight=seen)
-    return SourceFit(sources, seen, rays, obstacles, found)
+    return replace(sources, reflection=reflection, marks=marks), found
 
 
 def with_images(
@@ -141,23 +196,6 @@ def with_images(
     if silent is not None:
         sources = replace(sources, mirrors=~silent)
     return images_among(sources, probes, order=config.order, planes=config.planes, largest=config.largest)
-
-
-def _over(
-    sources: PointSources, found: tuple[Planes, Patches], surfaces: Surfaces, obstacles: Obstacles
-) -> tuple[PointSources, Surfaces, Obstacles]:
-    """Sources and surfaces over the planes that were found, and obstacles that know which Gaussians belong to them."""
-    planes, patches = found
-    sources = completed(sources, planes, patches)
-    surfaces = replace(surfaces, planes=planes, patches=patches)
-    surfaces = replace(surfaces, plane_of=with_skins(surfaces, obstacles.means))
-    return sources, surfaces, replace(obstacles, labels=surfaces.plane_of)
-
-
-def _known(direct: PointSources, surfaces: Surfaces) -> PointSources:
-    """The transmitter among the planes of the geometry, which reflect as dielectrics do, so far."""
-    reflection = torch.tensor(DIELECTRIC).expand(len(surfaces.planes), 3)
-    return replace(direct, planes=surfaces.planes, patches=surfaces.patches, reflection=reflection)
 
 
 def _fitted(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Obstacles) -> PointSources:
@@ -210,14 +248,6 @@ def _gated(sources: PointSources, spectra: Spectrum, seen: Tensor, obstacles: Ob
     sampled = bool((alike > OF_MESHES * len(obstacles.opacities)).any()) and spectra.delay is not None
     usual, best = GATES.index(USUAL_OF_MESHES if sampled else USUAL), int(wrong.argmin())
     return replace(sources, open_above=GATES[best if int(wrong[best]) < int(wrong[usual]) - worth else usual])
-
-
-def _refined(
-    sources: PointSources, seen: Tensor, peaks: Peaks, positions: Tensor, obstacles: Obstacles, config: SourceConfig
-) -> PointSources:
-    """The sources with their planes where the peaks of the images are."""
-    rays = sources.rays_each(positions, obstacles, in_sight=seen)
-    return replace(sources, planes=refined_planes(sources, rays, peaks, positions, config))
 
 
 def _probes(positions: Tensor, seed: int) -> Tensor:
