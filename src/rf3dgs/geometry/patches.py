@@ -116,7 +116,7 @@ class Patches:
         large = self.areas >= LARGE
         for plane in torch.nonzero(large).squeeze(-1).tolist():
             grid = self.grid(plane)
-            largest = torch.bincount(pieces_of(grid, HANGS)[grid]).max()
+            largest = torch.bincount(connected(grid, HANGS)[grid]).max()
             large[plane] = float(largest) * self.cell**2 >= LARGE
         return large
 
@@ -141,7 +141,7 @@ def surface_points(planes: Planes, patches: Patches) -> list[Tensor]:
     return points
 
 
-def pieces_of(grid: Tensor, gap: int) -> Tensor:
+def connected(grid: Tensor, gap: int) -> Tensor:
     """The number, from 1, of the piece that each cell `[row, column]` is of; 0 elsewhere.
 
     What touches, corners too, after it was widened by `gap` cells is one piece, with the cells by which it was widened.

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.geometry import Patches, Planes, Surfaces
-from rf3dgs.geometry.patches import closed, pieces_of, rim, surface_points, widened
+from rf3dgs.geometry.patches import closed, connected, rim, surface_points, widened
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.consolidation import PIECE_ANGLE, SKIN_ANGLE
 
@@ -113,7 +113,7 @@ def flat_pieces(surfaces: Surfaces, obstacles: Obstacles) -> Surfaces:
         own = torch.nonzero((plane_of == plane) & (obstacles.opacities >= obstacles.min_opacity)).squeeze(-1)
         if not len(own):
             continue
-        means, pieces = obstacles.means[own], pieces_of(grid, 1)
+        means, pieces = obstacles.means[own], connected(grid, 1)
         row, column = patches.cell_of(means, torch.full_like(own, plane)).unbind(-1)
         piece_of = pieces[row.clamp(0, len(grid) - 1), column.clamp(0, grid.shape[1] - 1)]
         gone = _not_flat(means @ patches.axes[plane].mT, means @ planes.normals[plane], piece_of)
