@@ -5,6 +5,7 @@ import torch
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.geometry import Patches, Planes, SurfaceConfig, Surfaces, find_surfaces
+from rf3dgs.geometry.patches import plane_axes
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.surface import sample_mesh
 
@@ -122,3 +123,15 @@ def test_a_plane_is_large_by_what_hangs_together():
     assert of(0.0, 1.0, 2.0)
     assert of(0.0, 1.3, 2.6)
     assert not of(0.0, 3.0, 6.0)
+
+
+def test_cells_are_those_under_points_however_far_off_the_plane_they_stand():
+    normal = torch.tensor([[0.6, 0.0, 0.8]])
+    planes = Planes(normal, torch.tensor([1.5]))
+    steps = torch.arange(0.05, 2.0, 0.1)
+    flat = torch.cartesian_prod(steps, steps) @ plane_axes(normal)[0] + 1.5 * normal
+    height = torch.linspace(-0.3, 0.3, len(flat))[:, None]
+    on, off = (Patches.of(planes, [points]) for points in (flat, flat + height * normal))
+    assert on.shape.tolist() == off.shape.tolist() == [[20, 20]]
+    assert torch.equal(on.cells, off.cells)
+    torch.testing.assert_close(on.low, off.low)

@@ -36,7 +36,7 @@ class Patches:
 
     @classmethod
     def of(cls, planes: Planes, points: Sequence[Tensor], cell: float = CELL) -> "Patches":
-        """The cells, `cell` [m] wide, that `points`, `[point, 3]` [m] for each plane, fall into."""
+        """The cells, `cell` [m] wide, that `points`, `[point, 3]` [m] for each plane, fall into along its normal."""
         axes = plane_axes(planes.normals)
         lows, shapes, cells = [], [], []
         for index, part in enumerate(points):
