@@ -1,6 +1,7 @@
 """Laws of the mirror model's fit, in a room whose walls scatter by laws that are known."""
 
 import math
+import os
 from dataclasses import replace
 
 import pytest
@@ -156,12 +157,14 @@ def test_the_log_says_what_each_part_explains(training, field):
     assert shares.tolist() == pytest.approx([parts.lit, parts.ambient], abs=1e-3)
 
 
-def test_the_same_spectra_give_the_same_bits(training, field):
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_the_same_spectra_give_the_same_bits_on_any_number_of_threads(training, field, monkeypatch, threads):
+    monkeypatch.setenv("RF3DGS_THREADS", threads)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
     again = fit_radio(room(), training, MIRROR)
-    assert torch.equal(again.surface.laws, field.surface.laws)
-    assert torch.equal(again.surface.level, field.surface.level)
-    assert torch.equal(again.surface.cell_sh, field.surface.cell_sh)
-    assert torch.equal(again.surface.cell_csi, field.surface.cell_csi)
+    assert torch.equal(again.sources.reflection, field.sources.reflection)
+    for name in ("laws", "ambient", "level", "segment_sh", "cell_sh", "cell_csi", "own_csi"):
+        assert torch.equal(getattr(again.surface, name), getattr(field.surface, name)), name
 
 
 def test_torch_works_on_one_thread_so_that_threads_do_not_change_the_bits(training, torch_threads):

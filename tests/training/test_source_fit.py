@@ -31,7 +31,7 @@ from rf3dgs.training.radio_views import ruled
 from rf3dgs.training.reflection import Glints, fit_reflection, glints, on_time, outshone, ray_powers, silent_planes
 from rf3dgs.training.source_fit import USUAL, USUAL_OF_MESHES, _gated, fit_sources
 from rf3dgs.training.timed_mirrors import timed_mirrors, with_timed
-from rf3dgs.training.virtual import Mirror
+from rf3dgs.training.virtual import Mirror, peaks_of
 
 SIZE = torch.tensor([9.0, 7.0, 3.2])
 TX = torch.tensor([2.1, 1.7, 2.6])
@@ -153,9 +153,14 @@ def test_a_wall_that_geometry_lacks_is_found_from_the_peaks(spectra):
         assert missed(fit.sources)[0] < 0.75 * known[0]
 
 
+def mirrors_of(shown, along):
+    """The mirrors that peaks of spectra tell, beside walls with normals `along`."""
+    return timed_mirrors(peaks_of(shown), shown, TX, along)
+
+
 def test_delay_and_departure_of_single_peaks_tell_the_walls(spectra):
     """Six images of one reflection, each in its place; what two or three reflections made is not taken for a wall."""
-    truth, found = walls().planes, timed_mirrors(spectra, TX, walls().planes.normals)
+    truth, found = walls().planes, mirrors_of(spectra, walls().planes.normals)
     assert len(found) == 6
     for mirror in found:
         plane = int((truth.normals @ mirror.normal).argmax())
@@ -163,7 +168,7 @@ def test_delay_and_departure_of_single_peaks_tell_the_walls(spectra):
         assert float(truth.normals[plane] @ mirror.normal) > math.cos(math.radians(0.5))
         assert abs(float(truth.offsets[plane] - mirror.offset)) < 0.03
         assert float((mirror.points @ truth.normals[plane] - truth.offsets[plane]).abs().max()) < 0.05
-    assert timed_mirrors(replace(spectra, delay=None, aod=None), TX, walls().planes.normals) == []
+    assert mirrors_of(replace(spectra, delay=None, aod=None), walls().planes.normals) == []
 
 
 def showing(pose: Pose, images: list[torch.Tensor], *, often: list[int] | None = None) -> Spectrum:
@@ -185,12 +190,12 @@ EASTERN = BOTH * torch.tensor([1.0, 1.0, -1.0])
 def test_one_position_is_witness_of_a_mirror_along_a_wall():
     """The east wall shines at one of forty. Without walls that it could stand along nothing is made of that."""
     shown = showing(receivers(40, 0), [FLOORED, EASTERN], often=[40, 1])
-    floor, board = timed_mirrors(shown, TX, walls().planes.normals)
+    floor, board = mirrors_of(shown, walls().planes.normals)
     assert len(floor.points) > 10
     assert len(board.points) == 1
     assert float(board.normal[0]) < -math.cos(math.radians(0.5))
     assert float(-board.offset) == pytest.approx(float(SIZE[0]), abs=0.03)
-    assert len(timed_mirrors(shown, TX, torch.zeros(0, 3))) == 1
+    assert len(mirrors_of(shown, torch.zeros(0, 3))) == 1
 
 
 def test_an_image_behind_what_bounds_the_site_is_no_mirror():
@@ -198,7 +203,7 @@ def test_an_image_behind_what_bounds_the_site_is_no_mirror():
     opposite = torch.tensor([-2 * SIZE[0] + TX[0], TX[1], TX[2]])  # in the east wall and then in the western one
     western = TX * torch.tensor([-1.0, 1.0, 1.0])
     shown = showing(receivers(40, 0), [western, opposite], often=[40, 3])
-    (known,) = timed_mirrors(shown, TX, walls().planes.normals)
+    (known,) = mirrors_of(shown, walls().planes.normals)
     assert float(known.normal[0]) > math.cos(math.radians(0.5))
 
 
@@ -232,9 +237,11 @@ def test_what_a_board_and_the_floor_reflect_is_no_tilted_mirror():
     """Of the east wall only its reflections over the floor are seen: one mirror through the edge would do the same."""
     shown = showing(receivers(40, 0), [FLOORED, BOTH])
     floor = torch.tensor([0.0, 0.0, 1.0])
-    (known,) = timed_mirrors(shown, TX, walls().planes.normals)
+    (known,) = mirrors_of(shown, walls().planes.normals)
     assert float(known.normal @ floor) > math.cos(math.radians(0.5))
-    first, second = timed_mirrors(shown, TX, torch.zeros(0, 3))  # without walls nothing tells it from a tilted one
+    first, second = timed_mirrors(
+        peaks_of(shown), shown, TX, torch.zeros(0, 3)
+    )  # without walls nothing tells it from a tilted one
     assert float(first.normal @ floor) > math.cos(math.radians(0.5))
     assert 0.2 < float(second.normal @ floor) < 0.5
 

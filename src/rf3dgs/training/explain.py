@@ -4,8 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from rf3dgs.core.grids import view_of
+from rf3dgs.core.threads import on_threads
 from rf3dgs.field.lit import LitSurface
 from rf3dgs.field.rays import Rays
 from rf3dgs.spectra.codec import DbWindow
@@ -68,18 +70,20 @@ def explained(
     area = spectra.grid.solid_angle / spectra.grid.solid_angle.sum()
     # Each with the residual, but for the first.
     parts = (surface.without_residual(), surface.only("lit"), surface.only("ambient"))
-    power, errors = torch.zeros(4, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    for number, arriving in enumerate(rays):
-        one = spectra[number]
+
+    def of(each: tuple[int, Rays]) -> tuple[Tensor, Tensor]:
+        one, arriving = spectra[each[0]], each[1]
         with torch.no_grad():
             values = torch.cat([part.values(one.pose.position, csi=False) for part in parts], -1)
             shown = surface.seen(values, view_of(one.pose, one.grid), backend)
         points = arriving.picture(one.pose, one.grid, one.instrument)
         laws, lit, ambient = (shown * surface.unit).unbind(-1)
-        power += torch.stack([(part.double() * area).sum() for part in (one.power, points, lit, ambient)])
         truth = window.encode(one.power)
-        for place, shown in enumerate((points, points + laws, points + lit + ambient)):
-            gap = (window.encode(shown) - truth).double() * window.span_db
-            errors[place] += (gap.square() * area).sum() / len(rays)
-    shares = (power[1:] / power[0]).tolist()
-    return Explained(*shares, *errors.sqrt().tolist())
+        gaps = [window.encode(shown) - truth for shown in (points, points + laws, points + lit + ambient)]
+        power = [(part.double() * area).sum() for part in (one.power, points, lit, ambient)]
+        errors = [((gap.double() * window.span_db).square() * area).sum() for gap in gaps]
+        return torch.stack(power), torch.stack(errors)
+
+    powers, errors = (torch.stack(column) for column in zip(*on_threads(of, enumerate(rays)), strict=True))
+    power = powers.sum(0)
+    return Explained(*(power[1:] / power[0]).tolist(), *errors.mean(0).sqrt().tolist())

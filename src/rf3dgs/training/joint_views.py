@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from rf3dgs.core.grids import View, view_of
+from rf3dgs.core.threads import on_threads
 from rf3dgs.field.lit import LitSurface
 from rf3dgs.field.radiance import NANOSECOND
 from rf3dgs.field.rays import Rays
@@ -48,7 +49,7 @@ def joint_views(
 ) -> list[JointView]:
     """The views of a `surface` as `spectra` `[position, row, col]` have them, with the `rays` to each; levels under
     `floor_db` are all one."""
-    return [_view(surface, spectra[number], one, floor_db, backend) for number, one in enumerate(rays)]
+    return on_threads(lambda each: _view(surface, spectra[each[0]], each[1], floor_db, backend), enumerate(rays))
 
 
 def _view(surface: LitSurface, one: Spectrum, rays: Rays, floor_db: float, backend: Backend) -> JointView:

@@ -1,5 +1,6 @@
 """The straight way from the transmitter, and what stands out of a spectrum in any direction."""
 
+import math
 from dataclasses import replace
 
 import torch
@@ -15,6 +16,7 @@ from rf3dgs.splats.obstacles import Obstacles
 THRESHOLDS = (0.1, 0.05, 0.2, 0.02, 0.3, 0.01, 0.5)
 SEEN_OVER_RING = 2.0
 SAME_LEVEL_DB = 6.0
+ROUNDING = 1e-5
 
 
 def standing_out(one: Spectrum, direction: Tensor) -> tuple[float, float]:
@@ -24,8 +26,12 @@ def standing_out(one: Spectrum, direction: Tensor) -> tuple[float, float]:
     least squares, and may be negative. Both are NaN where the instrument does not look there.
     """
     lobe = one.instrument.lobe
-    angle = angle_between(one.directions, direction.expand_as(one.directions))
-    angle, heard = torch.where(one.looked, angle, torch.inf), one.heard
+    along = one.grid.directions.reshape(-1, 3)
+    reach = min(max(4 * lobe, pixel_of(one)) + ROUNDING, math.pi)
+    around = torch.nonzero(along @ one.pose.to_device(direction) >= math.cos(reach) - ROUNDING).squeeze(-1)
+    world = one.pose.to_world(along[around])
+    angle = angle_between(world, direction.expand_as(world))
+    angle, heard = torch.where(one.looked.reshape(-1)[around], angle, torch.inf), one.heard.reshape(-1)[around]
     near = angle < max(0.5 * lobe, 0.75 * pixel_of(one))
     ring = (angle > 2 * lobe) & (angle < 4 * lobe)
     if not bool(near.any()) or not bool(ring.any()):

@@ -6,11 +6,12 @@ remains is the residual's (`training.residual`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from rf3dgs.core.threads import on_threads
 from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.field.lit import AMBIENT_DISTANCE, incidence
 from rf3dgs.field.radiance import NANOSECOND, bounce
@@ -28,7 +29,9 @@ STEPS = 12
 AMBIENT_ROUNDS = 3
 DARK = 1e-4  # visibility below which nothing arrives straight
 DB = 10 / 2.302585092994046
-MOST = 400_000
+MOST, ROWS_AT_ONCE = 400_000, 50_000
+UPPER = torch.triu_indices(5, 6)
+"""Rows and columns of the upper triangle of a law's normal matrix, with the right-hand side as a sixth column."""
 BAND = torch.tensor([degree for degree in range(4) for _ in range(2 * degree + 1)], dtype=torch.float32)
 
 
@@ -59,14 +62,11 @@ class Scattering:
 def fit_laws(scattering: Scattering, seen: Observations, without: Sequence[str] = ()) -> Tensor:
     """The laws `[S, 5]` of all segments, "lit" or "ambient" part `without` which the rest is fitted."""
     chosen = _some(len(seen), MOST)
-    g, weight = seen.gaussian[chosen], worth(seen.weight[chosen])
-    level = seen.level_db[chosen]
+    g, level = seen.gaussian[chosen], seen.level_db[chosen]
     along = view_directions(scattering.means[g] - seen.receivers[seen.view[chosen]], torch.zeros(3))
-    known = _known(scattering, g, along)
-    segment = scattering.segment_of[g]
-    everyone = torch.zeros_like(segment)
+    rows = _Rows(scattering.segment_of[g], _known(scattering, g, along), level, worth(seen.weight[chosen]))
     lit = scattering.visibility[g] > 0.5
-    excess = (level - known.lit_db)[lit]
+    excess = (level - rows.known.lit_db)[lit]
     first = float(excess.median()) if len(excess) else float(level.median()) + 20
     start = torch.tensor([[first, 0.0, 1.0, float(level.median()) - 6.0, 0.0]])
     start[0, 0] = OFF_DB if "lit" in without else start[0, 0]
@@ -74,8 +74,9 @@ def fit_laws(scattering: Scattering, seen: Observations, without: Sequence[str] 
     count = int(scattering.segment_of.max()) + 1
     if "lit" in without and "ambient" in without:
         return start.expand(count, -1).clone()
-    common = _refine(start, start, 0.0, everyone, known, level, weight)
-    laws = _refine(common.expand(count, -1).clone(), common, SHRINK, segment, known, level, weight)
+    everyone = replace(rows, segment=torch.zeros_like(rows.segment))
+    common = _refined(start, start, 0.0, everyone.parts())
+    laws = _refined(common.expand(count, -1).clone(), common, SHRINK, rows.parts())
     if "ambient" in without:  # nothing tells how fast what is not there falls off
         laws[:, 3], laws[:, 4] = OFF_DB, 0.0
     return laws
@@ -112,48 +113,64 @@ def law_db(laws: Tensor, known: _Known) -> tuple[Tensor, Tensor]:
     return lit, ambient + falloff * known.far_db
 
 
-def _refine(
-    laws: Tensor, common: Tensor, shrink: float, segment: Tensor, known: _Known, level: Tensor, weight: Tensor
-) -> Tensor:
-    """Damped Gauss-Newton on all segments at once."""
-    count = len(laws)
-    prior = torch.diag(shrink / LAW_SPREAD.square() * SOFT_DB).double() + 1e-6 * torch.eye(5, dtype=torch.float64)
-    damping = torch.full((count,), 1e-2, dtype=torch.float64)
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Observations as laws see them: segment `[M]`, what is known, level `[M]` [dB] and weight `[M]`."""
 
-    def cost_of(trial: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        lit, ambient = law_db(trial[segment], known)
+    segment: Tensor
+    known: _Known
+    level: Tensor
+    weight: Tensor
+
+    def parts(self) -> "list[_Rows]":
+        """The rows in parts that threads share."""
+        columns = (self.segment, *vars(self.known).values(), self.level, self.weight)
+        split = zip(*(column.split(ROWS_AT_ONCE) for column in columns), strict=True)
+        return [_Rows(segment, _Known(*known), level, weight) for segment, *known, level, weight in split]
+
+    def sums(self, laws: Tensor) -> Tensor:
+        """The soft-L1 cost of `laws` `[S, 5]`, the upper triangle of its normal matrix by rows, and the right-hand
+        side, `[S, 1 + 15 + 5]`."""
+        lit, ambient = law_db(laws[self.segment], self.known)
         total = torch.logaddexp(lit / DB, ambient / DB) * DB
-        error = level - total
-        soft = weight * SOFT_DB**2 * 2 * ((1 + (error / SOFT_DB).square()).sqrt() - 1)
-        cost = torch.zeros(count, dtype=torch.float64).index_add_(0, segment, soft.double())
-        away = (trial - common).double()
-        cost += (away @ prior * away).sum(-1)
-        return cost, lit, total, error
-
-    cost, lit, total, error = cost_of(laws)
-    for _ in range(STEPS):
+        error = self.level - total
+        root = (1 + (error / SOFT_DB).square()).sqrt()
         share = 10 ** ((lit - total) / 10)
-        columns = (share, share * DB * known.cosine, share * known.lobe_db, 1 - share, (1 - share) * known.far_db)
-        jacobian = torch.stack(columns, -1)
-        robust = weight / (1 + (error / SOFT_DB).square()).sqrt()
-        weighted = jacobian * robust[:, None]
-        left = torch.zeros(count, 25, dtype=torch.float64)
-        left.index_add_(0, segment, (weighted[:, :, None] * jacobian[:, None, :]).reshape(-1, 25).double())
-        right = torch.zeros(count, 5, dtype=torch.float64)
-        right.index_add_(0, segment, (weighted * error[:, None]).double())
-        left = left.reshape(-1, 5, 5) + prior
-        right = right - (laws - common).double() @ prior
+        cosine, lobe_db, far_db = self.known.cosine, self.known.lobe_db, self.known.far_db
+        columns = (share, share * DB * cosine, share * lobe_db, 1 - share, (1 - share) * far_db)
+        jacobian = torch.stack((*columns, error), -1)
+        weighted = jacobian[:, :5] * (self.weight / root)[:, None]
+        products = weighted[:, UPPER[0]] * jacobian[:, UPPER[1]]
+        cost = self.weight * SOFT_DB**2 * 2 * (root - 1)
+        rows = torch.cat((cost[:, None], products), -1).double()
+        return torch.zeros(len(laws), rows.shape[1], dtype=torch.float64).index_add_(0, self.segment, rows)
+
+
+def _refined(laws: Tensor, common: Tensor, shrink: float, parts: Sequence[_Rows]) -> Tensor:
+    """Damped Gauss-Newton on all segments at once, whose laws `[S, 5]` are drawn to the `common` one."""
+    prior = torch.diag(shrink / LAW_SPREAD.square() * SOFT_DB).double() + 1e-6 * torch.eye(5, dtype=torch.float64)
+    damping = torch.full((len(laws),), 1e-2, dtype=torch.float64)
+
+    def told(trial: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        sums = torch.stack(on_threads(lambda rows: rows.sums(trial), parts)).sum(0)
+        away = (trial - common).double()
+        left = sums.new_zeros(len(laws), 5, 6)
+        left[:, UPPER[0], UPPER[1]] = sums[:, 1:]
+        right, upper = left[..., 5] - away @ prior, left[..., :5]
+        left = upper + upper.triu(1).mT + prior
+        return sums[:, 0] + (away @ prior * away).sum(-1), left, right
+
+    cost, left, right = told(laws)
+    for _ in range(STEPS):
         diagonal = torch.diag_embed(left.diagonal(dim1=-2, dim2=-1) * damping[:, None] + 1e-9)
         step = torch.linalg.solve(left + diagonal, right)
         trial = (laws + step.float()).clamp(LAW_LOW, LAW_HIGH)
-        new_cost, new_lit, new_total, new_error = cost_of(trial)
+        new_cost, new_left, new_right = told(trial)
         better = new_cost < cost
         damping = torch.where(better, damping * 0.2, damping * 5).clamp(1e-6, 1e6)
-        laws = torch.where(better[:, None], trial, laws)
-        if bool(better.all()):
-            cost, lit, total, error = new_cost, new_lit, new_total, new_error
-        else:
-            cost, lit, total, error = cost_of(laws)
+        laws, right = (torch.where(better[:, None], *pair) for pair in ((trial, laws), (new_right, right)))
+        left = torch.where(better[:, None, None], new_left, left)
+        cost = torch.where(better, new_cost, cost)
     return laws
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.grids import View, view_of
+from rf3dgs.core.threads import on_threads
 from rf3dgs.field.lit import BLENDING, LitSurface
 from rf3dgs.field.radiance import NANOSECOND
 from rf3dgs.field.rays import Rays
@@ -119,8 +120,8 @@ def observe(geometry: Gaussians, views: Sequence[LitView], *, unit: float, backe
     shape = (geometry.means, geometry.quats, geometry.scales, geometry.opacities)
     has_csi = all(view.channels.shape[-1] == 5 for view in views)
     columns = 6 if has_csi else 2
-    rows = []
-    for number, one in enumerate(views):
+
+    def told(one: LitView) -> tuple[Tensor, Tensor]:
         values = torch.zeros((len(geometry), columns)).requires_grad_()
         with torch.enable_grad():
             raster = rasterize(*shape, values, one.view, compositing=BLENDING, backend=backend)
@@ -128,8 +129,9 @@ def observe(geometry: Gaussians, views: Sequence[LitView], *, unit: float, backe
             target = torch.cat((torch.ones_like(target[..., :1]), target), -1) * one.certain[..., None]
             (sums,) = torch.autograd.grad(raster.values, values, target)
         chosen = ((sums[:, 0] > LEAST_WEIGHT) & (sums[:, 1] > 0)).nonzero().squeeze(-1)
-        rows.append((chosen, torch.full_like(chosen, number), sums[chosen]))
-    gaussian, view, sums = _joined(rows)
+        return chosen, sums[chosen]
+
+    gaussian, view, sums = _joined(on_threads(told, views))
     power = sums[:, 1] / sums[:, 0] * unit
     return Observations(
         gaussian=gaussian,
@@ -150,8 +152,9 @@ def shortfall(
     (`LitSurface.hit_in`). Levels under `floor_db`, or a pixel's own floor, count as that.
     """
     has_csi = all(view.channels.shape[-1] == 5 for view in views)
-    rows = []
-    for number, (one, hit) in enumerate(zip(views, hits, strict=True)):
+
+    def lacking(shown_to: tuple[LitView, Tensor]) -> tuple[Tensor, Tensor]:
+        one, hit = shown_to
         part = surface.subset(hit)
         with torch.no_grad():
             values = part.values(one.view.position, csi=has_csi)
@@ -164,9 +167,9 @@ def shortfall(
             (sums,) = torch.autograd.grad(shown, values, upstream)
         sums = sums * sent
         chosen = sums[:, 0] > LEAST_WEIGHT
-        gaussian = hit.nonzero().squeeze(-1)[chosen]
-        rows.append((gaussian, torch.full_like(gaussian, number), sums[chosen]))
-    gaussian, view, sums = _joined(rows)
+        return hit.nonzero().squeeze(-1)[chosen], sums[chosen]
+
+    gaussian, view, sums = _joined(on_threads(lacking, zip(views, hits, strict=True)))
     level = (gaussian, view, sums[:, 0].contiguous(), sums[:, 1] / sums[:, 0])
     if not has_csi:
         return Shortfall(*level)
@@ -197,7 +200,8 @@ def _lacking(shown: Tensor, one: LitView, unit: float, floor_db: float) -> Tenso
     return torch.stack((*level, slow, slow * late, bent, *(bent[..., None] * turned).unbind(-1)), -1)
 
 
-def _joined(rows: Sequence[tuple[Tensor, Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
-    """The rows of all views, one after another."""
-    first, second, third = zip(*rows, strict=True)
-    return torch.cat(first), torch.cat(second), torch.cat(third)
+def _joined(rows: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
+    """The Gaussians and sums of all views, one view after another, and the number of each one's view in between."""
+    gaussian, sums = zip(*rows, strict=True)
+    view = torch.arange(len(rows)).repeat_interleave(torch.tensor([len(part) for part in gaussian]))
+    return torch.cat(gaussian), view, torch.cat(sums)

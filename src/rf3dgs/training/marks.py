@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rf3dgs.core.threads import on_threads
 from rf3dgs.field.sources import Marks
 from rf3dgs.geometry import Patches, Planes
 from rf3dgs.geometry.patches import surface_points
@@ -50,11 +51,14 @@ class Paint:
     def at(self, points: Tensor, plane: Tensor) -> Tensor:
         """Colours `[n, 3]` around points `[n, 3]` [m] of planes `[n]`; grey where nothing is painted."""
         result = torch.full((len(points), 3), 0.5)
-        for number in plane.unique().tolist():
+
+        def painted(number: int) -> None:
             here, own = torch.nonzero(plane == number).squeeze(-1), self.plane == number
             near = torch.exp(-0.5 * torch.cdist(points[here], self.means[own]) ** 2 / BRUSH**2) * self.weight[own]
             total = near.sum(-1, keepdim=True)
             result[here] = torch.where(total > 1e-9, near @ self.colours[own] / total.clamp_min(1e-12), 0.5)
+
+        on_threads(painted, plane.unique().tolist())
         return result
 
 

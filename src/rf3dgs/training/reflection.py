@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.angles import angle_between
+from rf3dgs.core.threads import on_threads
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.field.images import HIGHEST_ORDER
 from rf3dgs.field.rays import Rays
@@ -68,12 +69,10 @@ def glints(sources: PointSources, rays: list[Rays], spectra: Spectrum) -> Glints
     Of waves that arrive as one those that by their laws are much the weaker ones are not looked for: a transmitter
     beside a wall sends every reflection twice, and what is seen is the one that did not go over that wall.
     """
-    parts = []
-    for position, one in enumerate(rays):
-        spectrum = spectra[position]
+
+    def at(position: int) -> list[Tensor]:
+        one, spectrum = rays[position], spectra[position]
         one = one.only(~outshone(one, APART_LOBES * spectrum.instrument.lobe))
-        if not len(one):
-            continue
         power, ring = ray_powers(spectrum, one.arrival)
         free = friis_gain(one.delay * SPEED_OF_LIGHT, sources.frequency) * 10 ** (sources.level_db / 10)
         apart = angle_between(one.arrival[:, None], one.arrival[None]) + torch.pi * torch.eye(len(one))
@@ -88,7 +87,9 @@ def glints(sources: PointSources, rays: list[Rays], spectra: Spectrum) -> Glints
         cosine = (legs * sources.planes.normals[plane.clamp_min(0)]).sum(-1).abs().double()
         columns = (torch.full_like(one.index, position), one.index, plane, one.points, cosine)
         levels = (_decibels(power / free), _decibels(limit / free), (power > ring) & timely, ~crowded)
-        parts.append([column[kept] for column in (*columns, *levels)])
+        return [column[kept] for column in (*columns, *levels)]
+
+    parts = on_threads(at, [position for position, one in enumerate(rays) if len(one)])
     if not parts:
         none, count = torch.zeros(0), torch.zeros(0, dtype=torch.long)
         rows, level = torch.zeros(0, 3), torch.zeros(0, dtype=torch.float64)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from rf3dgs.core.threads import on_threads
 from rf3dgs.field.lit import CSI_DEGREE, LARGEST_RESIDUAL_DB, LitSurface
 from rf3dgs.splats.harmonics import C0, basis, view_directions
 from rf3dgs.splats.rasterize import Backend
@@ -48,7 +49,7 @@ def refine_residual(
     """
     receivers = torch.stack([one.view.position for one in views])
     groups = Groups.of(surface)
-    hits = [surface.hit_in(one.view, backend) for one in views] if passes else []
+    hits = on_threads(lambda one: surface.hit_in(one.view, backend), views) if passes else []
     for _ in range(passes):
         surface = _corrected(surface, receivers, groups, shortfall(surface, views, hits, floor_db, backend))
     return surface
@@ -75,7 +76,12 @@ class Groups:
 
 def _corrected(surface: LitSurface, receivers: Tensor, groups: Groups, lacking: Shortfall) -> LitSurface:
     told = _Told.of(surface, receivers, lacking)
-    segment, cell, own = _solved(surface, groups, told, lacking.weight, lacking.error_db[:, None], DEGREE, RIDGE)
+    asked = [(lacking.weight, lacking.error_db[:, None], DEGREE, RIDGE)]
+    if lacking.csi_weight is not None and lacking.csi_error is not None:
+        late, turned = lacking.csi_error.split((1, 3), -1)
+        slow, bent = lacking.csi_weight.unbind(-1)
+        asked += [(slow, late, CSI_DEGREE, DELAY_RIDGE), (bent, turned, CSI_DEGREE, DEPARTURE_RIDGE)]
+    (segment, cell, own), *csi = on_threads(lambda one: _solved(surface, groups, told, *one), asked)
     level = (surface.level + own[:, 0]).clamp(-LARGEST_RESIDUAL_DB, LARGEST_RESIDUAL_DB)
     surface = replace(
         surface,
@@ -83,15 +89,9 @@ def _corrected(surface: LitSurface, receivers: Tensor, groups: Groups, lacking: 
         cell_sh=surface.cell_sh + cell[..., 0],
         level=level,
     )
-    if lacking.csi_weight is None or lacking.csi_error is None:
+    if not csi:
         return surface
-    late, turned = lacking.csi_error.split((1, 3), -1)
-    weights = lacking.csi_weight.unbind(-1)
-    parts = (
-        _solved(surface, groups, told, weights[0], late, CSI_DEGREE, DELAY_RIDGE),
-        _solved(surface, groups, told, weights[1], turned, CSI_DEGREE, DEPARTURE_RIDGE),
-    )
-    segment, cell, own = (torch.cat(part, -1) for part in zip(*parts, strict=True))
+    segment, cell, own = (torch.cat(part, -1) for part in zip(*csi, strict=True))
     return replace(
         surface,
         segment_csi=surface.segment_csi + segment,

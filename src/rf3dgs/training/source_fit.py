@@ -22,7 +22,7 @@ from rf3dgs.training.marks import Paint, fit_marks
 from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_reflection, glints, silent_planes, silent_sources
 from rf3dgs.training.small_planes import flat_pieces, outlined, standing, with_both_faces
 from rf3dgs.training.timed_mirrors import timed_mirrors, with_timed
-from rf3dgs.training.virtual import completed, find_mirrors, peaks_of, refined_planes, with_mirrors
+from rf3dgs.training.virtual import Peaks, completed, find_mirrors, peaks_of, refined_planes, with_mirrors
 
 PROBES = 150
 PROBE_MARGIN = 0.5
@@ -77,11 +77,12 @@ def fit_sources(
         obstacles = replace(obstacles, labels=None).cleared(tx.position.expand_as(positions), positions, seen)
         return SourceFit(direct, seen, direct.rays_each(positions, obstacles, in_sight=seen), obstacles)
     probes = torch.cat((positions, _probes(positions, config.seed)))
-    site, timed = _placed(direct, surfaces, obstacles, spectra, config)
+    peaks = peaks_of(spectra)
+    site, timed = _placed(direct, surfaces, obstacles, spectra, peaks, config)
     site = replace(site, sources=with_images(site.sources, probes, replace(config, order=1)))
     by_bearings = replace(config, complete=config.complete and not timed)
     if by_bearings.refine or by_bearings.complete:
-        site = _told_by_bearings(site, spectra, seen, probes, by_bearings)
+        site = _told_by_bearings(site, spectra, peaks, seen, probes, by_bearings)
     site = _opened(site, spectra, seen)
     paint = None if geometry is None else Paint.of(geometry, site.surfaces.plane_of)
     sources, found = _levelled(site, spectra, seen, probes, paint, config)
@@ -116,7 +117,12 @@ class _Site:
 
 
 def _placed(
-    direct: PointSources, surfaces: Surfaces, obstacles: Obstacles, spectra: Spectrum, config: SourceConfig
+    direct: PointSources,
+    surfaces: Surfaces,
+    obstacles: Obstacles,
+    spectra: Spectrum,
+    peaks: Peaks,
+    config: SourceConfig,
 ) -> tuple[_Site, bool]:
     """The transmitter among planes that are whole, square and where delays put them; and whether any delay did.
 
@@ -127,16 +133,18 @@ def _placed(
     known = replace(direct, planes=surfaces.planes, patches=surfaces.patches, reflection=reflection)
     site = _Site.of(known, surfaces, obstacles)
     walls = surfaces.planes.normals[surfaces.patches.large]
-    timed = timed_mirrors(spectra, direct.tx, walls) if config.complete else []
+    timed = timed_mirrors(peaks, spectra, direct.tx, walls) if config.complete else []
     if timed:
         site = site.over(*with_timed(site.sources, timed))
     surfaces = squared(site.surfaces) if config.square else site.surfaces
     return _Site.of(site.sources, flat_pieces(surfaces, site.obstacles), site.obstacles), bool(timed)
 
 
-def _told_by_bearings(site: _Site, spectra: Spectrum, seen: Tensor, probes: Tensor, config: SourceConfig) -> _Site:
+def _told_by_bearings(
+    site: _Site, spectra: Spectrum, peaks: Peaks, seen: Tensor, probes: Tensor, config: SourceConfig
+) -> _Site:
     """The site with its planes where peaks have their images, and with mirrors that peaks without one point to."""
-    positions, peaks = spectra.pose.position, peaks_of(spectra)
+    positions = spectra.pose.position
 
     def refined(site: _Site) -> _Site:
         rays = site.sources.rays_each(positions, site.obstacles, in_sight=seen)

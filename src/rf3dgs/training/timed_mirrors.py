@@ -18,10 +18,8 @@ from rf3dgs.field.images import image_chain, sequences
 from rf3dgs.field.sources import PointSources
 from rf3dgs.geometry import Patches, Planes
 from rf3dgs.geometry.patches import surface_points
-from rf3dgs.spectra.peaks import find_peaks
 from rf3dgs.spectra.spectrum import Spectrum
-from rf3dgs.training.line_of_sight import standing_out
-from rf3dgs.training.virtual import DISC, NEAREST_IMAGE, PEAKS, Mirror, discs
+from rf3dgs.training.virtual import DISC, NEAREST_IMAGE, Mirror, Peaks, discs
 
 STANDS_OUT = 4.0  # over the surroundings: a peak's delay is then nearly its own
 DEPARTURE = math.radians(2.0)
@@ -36,8 +34,8 @@ SMALL_DISC = (0.2, 0.4)  # and around any where the plane is small: tops of a ta
 ROUNDS = 5
 
 
-def timed_mirrors(spectra: Spectrum, tx: Tensor, walls: Tensor) -> list[Mirror]:
-    """The mirrors that peaks of `spectra` `[position, row, col]` tell of a transmitter at `tx` `[3]`, those that most
+def timed_mirrors(peaks: Peaks, spectra: Spectrum, tx: Tensor, walls: Tensor) -> list[Mirror]:
+    """The mirrors that `peaks` of `spectra` `[position, row, col]` tell of a transmitter at `tx` `[3]`, those that most
     positions see first; none where spectra have no delay or departure.
 
     An image counts that four positions see within 30 cm of one place, unless two or three reflections in the mirrors
@@ -46,7 +44,7 @@ def timed_mirrors(spectra: Spectrum, tx: Tensor, walls: Tensor) -> list[Mirror]:
     it: what a board and the floor reflect seems to come from one tilted mirror over the edge between both. Of mirrors
     along walls, and inside the site, one position is witness enough: nothing else puts an image 10 cm beside an axis.
     """
-    position, image = _images(spectra, tx)
+    position, image = _images(peaks, spectra, tx)
     receivers, mirrors = spectra.pose.position, []
     while len(mirrors) < MOST_FOUND and len(position):
         mirror, near = _best(position, image, receivers, tx)
@@ -152,21 +150,19 @@ def _off_axis(way: Tensor, axes: Tensor) -> float:
     return min(torch.linalg.vector_norm(aside, dim=-1).tolist(), default=math.inf)
 
 
-def _images(spectra: Spectrum, tx: Tensor) -> tuple[Tensor, Tensor]:
+def _images(peaks: Peaks, spectra: Spectrum, tx: Tensor) -> tuple[Tensor, Tensor]:
     """Positions `[n]` and images `[n, 3]` [m] of the peaks that one reflection explains."""
     positions, images = [], []
     if spectra.delay is None or spectra.aod is None:
         return torch.zeros(0, dtype=torch.long), torch.zeros(0, 3)
+    peaks = peaks.only(peaks.over > STANDS_OUT)
     for number in range(len(spectra)):
         one = spectra[number]
         assert one.delay is not None
         assert one.aod is not None
-        found, _ = find_peaks(one.power, one.grid, count=PEAKS, separation=one.instrument.lobe)
-        for bearing in one.pose.to_world(found):
-            power, ring = standing_out(one, bearing)
-            if not power > (STANDS_OUT - 1) * ring:
-                continue
-            pixel = int((one.directions.reshape(-1, 3) @ bearing).argmax())
+        directions = one.directions.reshape(-1, 3)
+        for bearing in peaks.bearing[peaks.position == number]:
+            pixel = int((directions @ bearing).argmax())
             way = float(one.delay.flatten()[pixel]) * SPEED_OF_LIGHT
             image = one.pose.position + way * bearing
             if float(torch.linalg.vector_norm(image - tx)) < NEAREST_IMAGE:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.angles import angle_between
+from rf3dgs.core.threads import on_threads
 from rf3dgs.field.images import image_chain, mirrored, sequences
 from rf3dgs.field.rays import Rays
 from rf3dgs.field.sources import PointSources
@@ -39,29 +40,32 @@ NEAREST_IMAGE = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Peaks:
-    """Peaks that stand 3 dB over their surroundings: position `[n]`, bearing `[n, 3]` (world) of each."""
+    """Peaks that stand 3 dB over their surroundings: position `[n]`, bearing `[n, 3]` (world) of each, and how many
+    times the surroundings it is, `over` `[n]`."""
 
     position: Tensor
     bearing: Tensor
+    over: Tensor
 
     def only(self, chosen: Tensor) -> "Peaks":
         """Some of them, by a mask or list."""
-        return Peaks(self.position[chosen], self.bearing[chosen])
+        return Peaks(self.position[chosen], self.bearing[chosen], self.over[chosen])
 
 
 def peaks_of(spectra: Spectrum) -> Peaks:
     """The strongest peaks of spectra `[position, row, col]`."""
-    positions, bearings = [], []
-    for number in range(len(spectra)):
+
+    def at(number: int) -> Peaks:
         one = spectra[number]
         found, _ = find_peaks(one.power, one.grid, count=PEAKS, separation=one.instrument.lobe)
-        for bearing in one.pose.to_world(found):
-            power, ring = standing_out(one, bearing)
-            if power > (SEEN_OVER_RING - 1) * ring:
-                positions.append(number)
-                bearings.append(bearing)
-    where = torch.tensor(positions, dtype=torch.long)
-    return Peaks(where, torch.stack(bearings) if bearings else torch.zeros(0, 3))
+        bearing = one.pose.to_world(found)
+        shown = [standing_out(one, each) for each in bearing]
+        power, ring = torch.tensor(shown, dtype=torch.float64).reshape(-1, 2).unbind(-1)
+        every = Peaks(torch.full((len(bearing),), number), bearing, 1 + power / ring.clamp_min(1e-300))
+        return every.only(every.over > SEEN_OVER_RING)
+
+    parts = on_threads(at, range(len(spectra)))
+    return Peaks(*(torch.cat([getattr(part, name) for part in parts]) for name in ("position", "bearing", "over")))
 
 
 def refined_planes(
