@@ -216,7 +216,7 @@ def made(wish: argparse.Namespace) -> tuple[bytes, dict[str, Any]]:
             answers[method.name] = like(truth, power)
         groups.append(Group(GROUPS[group], truth, answers, task.window))
     first = groups[0].truth
-    photo = photograph(wish.photo, ideal.scene, first.pose[0], first.grid, ideal.geometry)
+    photo = photograph(wish.photo, ideal.scene, first.pose[0], first.grid, ideal.geometry(wish.seed))
     return draw(photo, groups), {
         "scale": wish.scale,
         "seed": wish.seed,

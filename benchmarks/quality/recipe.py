@@ -87,7 +87,7 @@ def values_of(predictor: Predictor, truth: Spectrum, window: DbWindow) -> Values
 
 def measured(study: Study, wish: argparse.Namespace) -> dict[str, Any]:
     """All values of all models, positions and seeds."""
-    judged, geometry = study.truth("random"), study.geometry
+    judged = study.truth("random")
     steps = wish.steps or STEPS[study.config.scale]
     rows = []
     for count in wish.positions or [POSITIONS[study.config.scale]]:
@@ -110,7 +110,7 @@ def measured(study: Study, wish: argparse.Namespace) -> dict[str, Any]:
         "held": len(judged.spectra) // judged.views,
         "views": judged.views,
         "size": list(study.config.pictures.size),
-        "gaussians": len(geometry),
+        "gaussians": [len(study.geometry(seed)) for seed in wish.seeds],
         "seeds": wish.seeds,
         "jet_gap_db": jet_gap_db(judged.window.encode(judged.spectra.power)),
     }

@@ -57,9 +57,10 @@ def caption(run: Mapping[str, Any]) -> str:
     low, high = run["window_db"]
     total = sum(row["fit_cpu_s"] + row["judging_cpu_s"] for row in run["rows"])
     width, height = run["size"]
+    gaussians = ", ".join(f"{count:,}" for count in run["gaussians"])
     return (
         f"{run['held']} {run['judge']} positions, {run['views']} pictures of {width}x{height} each; "
-        f"{run['gaussians']:,} Gaussians; {run['steps']:,} iterations; window {low:g} to {high:g} dB; mean over "
+        f"{gaussians} Gaussians; {run['steps']:,} iterations; window {low:g} to {high:g} dB; mean over "
         f"seeds {', '.join(str(seed) for seed in run['seeds'])}. While errors are small jet RGB is "
         f"{run['jet_gap_db']:.1f} dB below grey. Fits and judging took {total:.0f} s of CPU time."
     )

@@ -7,11 +7,13 @@ import torch
 from benchmarks.quality.protocol import data, scenes
 from benchmarks.quality.protocol.data import geometry_of
 from benchmarks.quality.protocol.scenes import MOVED, SITES, Setting, under_a_roof
+from benchmarks.quality.protocol.study import Study, StudyConfig
 
 from rf3dgs.core.errors import InputError
 from rf3dgs.propagation.sites.lobby import lobby
 from rf3dgs.propagation.sites.scene import SceneObject
 from rf3dgs.propagation.sites.shapes import box
+from rf3dgs.splats.gaussians import Gaussians
 
 
 def test_only_points_below_a_face_are_under_a_roof():
@@ -77,6 +79,18 @@ def test_a_mesh_is_sampled_once(tmp_path, monkeypatch):
     first = geometry_of("mesh", setting, tmp_path, count=500)
     monkeypatch.setattr("benchmarks.quality.protocol.data.sample_mesh", lambda *args, **named: pytest.fail("again"))
     assert torch.equal(first.means, geometry_of("mesh", setting, tmp_path, count=500).means)
+
+
+def test_every_seed_has_geometry_of_its_own(tmp_path, monkeypatch):
+    def grown(photos, config, *, progress=None):
+        return Gaussians.random(40, [0.0, 0.0, 0.0], [1.0, 1.0, 1.0], degree=0, seed=config.seed)
+
+    monkeypatch.setattr("rf3dgs.training.visual.fit_geometry", grown)
+    study = Study(StudyConfig("lobby", "diffuse", tmp_path))
+    first, second = study.geometry(0), study.geometry(1)
+    assert not torch.equal(first.means, second.means)
+    monkeypatch.setattr("rf3dgs.training.visual.fit_geometry", lambda *args, **named: pytest.fail("again"))
+    assert torch.equal(Study(StudyConfig("lobby", "diffuse", tmp_path)).geometry(1).means, second.means)
 
 
 def test_photographs_of_a_scene_that_has_none_are_refused(tmp_path):

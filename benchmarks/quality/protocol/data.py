@@ -4,7 +4,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -224,31 +224,32 @@ def _spectra(paths: Path, folder: Path, count: int, pictures: Pictures, progress
 
 
 def geometry_of(
-    kind: str, setting: Setting, folder: Path, *, count: int, progress: Progress | None = None
+    kind: str, setting: Setting, folder: Path, *, count: int, seed: int = 0, progress: Progress | None = None
 ) -> Gaussians:
-    """Gaussians of the scene: "photos" by the demo's visual stage on the shipped photographs, "mesh" on its surfaces.
+    """Gaussians of the scene: "photos" by the demo's visual stage on the shipped photographs with a `seed`, "mesh" on
+    its surfaces, so many and the same for every seed.
 
     Made once and kept in `folder`. Where things have moved the geometry shows them as they were before. Any other
     `kind` is a .ply file.
     """
     if kind not in ("photos", "mesh"):
         return read_ply(Path(kind))
-    path = folder / (f"{kind}.ply" if kind == "photos" else f"{kind}-{count}.ply")
+    path = folder / (f"{kind}-{seed}.ply" if kind == "photos" else f"{kind}-{count}.ply")
     if not path.exists():
-        made = _from_photographs(setting, progress) if kind == "photos" else _from_mesh(setting, count)
+        made = _from_photographs(setting, seed, progress) if kind == "photos" else _from_mesh(setting, count)
         folder.mkdir(parents=True, exist_ok=True)
         write_ply(path, made)
     return read_ply(path)
 
 
-def _from_photographs(setting: Setting, progress: Progress | None) -> Gaussians:
+def _from_photographs(setting: Setting, seed: int, progress: Progress | None) -> Gaussians:
     from rf3dgs.cli.demo import Demo
     from rf3dgs.cli.facts import open_dataset
     from rf3dgs.training.visual import fit_geometry
 
     if setting.photographs != "lobby":
         raise InputError(f"nobody photographed the scene {setting.name!r}; use --geometry mesh")
-    return fit_geometry(open_dataset("lobby").train.photos, Demo().visual, progress=progress)
+    return fit_geometry(open_dataset("lobby").train.photos, replace(Demo().visual, seed=seed), progress=progress)
 
 
 def _from_mesh(setting: Setting, count: int) -> Gaussians:

@@ -69,7 +69,7 @@ class StudyConfig:
     """Of traced paths; None: as `rf3dgs trace`."""
     pictures: Pictures = SPHERE
     geometry: str = "photos"
-    """"photos", "mesh", or a .ply file."""
+    """"photos", of which every seed has its own Gaussians, "mesh", or a .ply file."""
     geometry_folder: Path | None = None
     """Where made geometry is kept; None: in `out`."""
     mesh_count: int = 100_000
@@ -98,6 +98,7 @@ class Study:
         self.config = config
         self.setting = Setting(config.scene, config.preset)
         self._truths: dict[str, Truth] = {}
+        self._geometry: dict[int, Gaussians] = {}
 
     @cached_property
     def data(self) -> Data:
@@ -123,12 +124,15 @@ class Study:
         """The folder of paths that the data are made from, receiver by receiver."""
         return self.config.paths.get(self.config.preset) or self._folder(self.setting) / FIRST
 
-    @cached_property
-    def geometry(self) -> Gaussians:
+    def geometry(self, seed: int) -> Gaussians:
+        """The Gaussians that methods build on whose training positions are drawn by `seed`."""
         config, setting = self.config, self.setting
-        site = "lobby" if setting.photographs else setting.name
-        folder = config.geometry_folder or config.out / "geometry"
-        return geometry_of(config.geometry, setting, folder / site, count=config.mesh_count)
+        if seed not in self._geometry:
+            site = "lobby" if setting.photographs else setting.name
+            folder = config.geometry_folder or config.out / "geometry"
+            made = geometry_of(config.geometry, setting, folder / site, count=config.mesh_count, seed=seed)
+            self._geometry[seed] = made
+        return self._geometry[seed]
 
     @cached_property
     def base(self) -> dict[str, Any]:
@@ -153,7 +157,7 @@ class Study:
         """What methods are trained on: `count` positions drawn by `seed`."""
         config, before = self.config, self.before
         train = before.training(count, seed, draw)
-        gaussians = self.geometry if geometry else None
+        gaussians = self.geometry(seed) if geometry else None
         return Task(train, before.window(), seed, config.scale, gaussians, self.scene)
 
     def add(

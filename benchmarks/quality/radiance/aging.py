@@ -90,7 +90,7 @@ def main(words: Sequence[str] | None = None) -> int:
         run, seed = Run(wish), own.seed
         study = run.study(wish.preset[0])
         now, then = study.data, run.study(wish.preset[0], BEFORE[own.scene]).data
-        window, geometry = then.window(), study.geometry
+        window, geometry = then.window(), study.geometry(seed)
 
         def made(model: Method, train: Spectrum) -> Predictor:
             return model.made(Task(train, window, seed, "paper", geometry))
