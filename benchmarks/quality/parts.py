@@ -1,6 +1,6 @@
 """What each part of a mirror field sends to one receiver, as four pictures of the whole sphere.
 
-    python -m benchmarks.quality.parts site.field --at 8 5 1.5 [--out docs/pictures/parts.png]
+    python -m benchmarks.quality.parts lobby --at 8 5 1.5 [--out docs/pictures/parts.png]
 
 From the top: the whole field, its point sources, its lit surfaces, its ambient light. Yellow is 15 dB under the
 strongest direction of the whole and above, blue 75 dB under it and below. A second.
@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from rf3dgs.cli.facts import open_field
 from rf3dgs.core.files import write_whole
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import equirect_grid
@@ -41,11 +42,11 @@ def stacked(field: RadioField, pose: Pose) -> np.ndarray:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("field", type=Path)
+    parser.add_argument("field", help='a field\'s folder, or "lobby" for the one that ships with the package')
     parser.add_argument("--at", type=float, nargs=3, required=True, metavar=("X", "Y", "Z"))
     parser.add_argument("--out", type=Path, default=Path("docs/pictures/parts.png"))
     options = parser.parse_args()
-    picture = Image.fromarray(stacked(RadioField.load(options.field), Pose(options.at)))
+    picture = Image.fromarray(stacked(open_field(options.field), Pose(options.at)))
     buffer = io.BytesIO()
     picture.quantize(COLOURS, dither=Image.Dither.NONE).save(buffer, format="PNG", optimize=True)
     write_whole(options.out, buffer.getvalue())

@@ -233,7 +233,7 @@ def in_free_space(points: Tensor, echoes: Echoes) -> Tensor:
     return (passed[own] >= PASSED) & (passed[own] > PASSED_OVER_HIT * hit[own])
 
 
-def cells_of(planes: Planes, patches: Patches) -> tuple[Tensor, Tensor]:
+def surface_cells(planes: Planes, patches: Patches) -> tuple[Tensor, Tensor]:
     """The middles `[cell, 3]` [m] of all cells that are surface, and the plane `[cell]` of each."""
     points = surface_points(planes, patches)
     if not points:

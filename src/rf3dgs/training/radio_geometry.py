@@ -23,11 +23,11 @@ from rf3dgs.training.echo_planes import (
     REGION,
     behind,
     bounding,
-    cells_of,
     filled,
     in_free_space,
     owner_of,
     refined_by_echoes,
+    surface_cells,
 )
 from rf3dgs.training.echoes import Echoes, Spots, echoes_of, merged
 from rf3dgs.training.line_of_sight import fit_line_of_sight
@@ -161,7 +161,7 @@ def _with_planes(planes: Planes, patches: Patches, spots: Spots, echoes: Echoes)
 
     But for the planes that bound the site, nothing stands where waves were seen to cross.
     """
-    cells, plane = cells_of(planes, patches)
+    cells, plane = surface_cells(planes, patches)
     bounds = torch.tensor(bounding(planes, patches, echoes), dtype=torch.long)
     held = torch.isin(plane, bounds) | ~in_free_space(cells, echoes)
     walls = _flat(cells[held], planes.normals[plane[held]], patches.cell)
