@@ -60,5 +60,6 @@ inline View view_of(const In<4, 4>& viewmat, const std::optional<In<3, 3>>& came
 void bind_loss(nb::module_& m);
 void bind_obstacles(nb::module_& m);
 void bind_trainer(nb::module_& m);
+void bind_ways(nb::module_& m);
 
 }  // namespace rf3dgs

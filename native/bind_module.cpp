@@ -204,6 +204,7 @@ NB_MODULE(_native, m) {
   bind_loss(m);
   bind_obstacles(m);
   bind_trainer(m);
+  bind_ways(m);
   bind_floor(m);
   bind_spectra(m);
 }

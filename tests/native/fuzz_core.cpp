@@ -14,6 +14,7 @@
 #include <cstring>
 #include <functional>
 #include <limits>
+#include <memory>
 #include <random>
 #include <stdexcept>
 #include <thread>
@@ -29,6 +30,7 @@
 #include "splats/morton.hpp"
 #include "splats/rasterize.hpp"
 #include "splats/trainer.hpp"
+#include "ways/ways.hpp"
 
 using namespace rf3dgs;
 
@@ -509,6 +511,56 @@ void segments() {
   require(same_bits(once, again), "what passes does not depend on the number of threads");
 }
 
+void ways() {
+  const int64_t planes = one_of<int64_t>({1, 2, 6}), sources = one_of<int64_t>({1, 7, 40});
+  const size_t count = one_of<size_t>({0, 1, 63, 65, 200});
+  const auto drawn = [](size_t size, double spread) {
+    std::vector<double> values(size);
+    for (double& value : values) value = chance(0.02f) ? hostile() : spread * normal();
+    return values;
+  };
+  const auto chain = drawn(12 * sources, 5.0), normals = drawn(3 * (planes + 1), 1.0), offsets = drawn(planes + 1, 3.0);
+  const auto side = drawn(sources, 3.0), axes = drawn(6 * planes, 5.0), low = drawn(2 * planes, 9.0);
+  const auto receivers = drawn(3 * count, 5.0);
+  std::vector<int64_t> sequence(3 * sources, -1), order(sources), last(sources, -1), wide(planes), start(planes);
+  for (int64_t source = 0; source < sources; ++source) {
+    order[source] = one_of<int64_t>({0, 1, 2, 3});
+    for (int64_t step = 0; step < order[source]; ++step) {
+      last[source] = sequence[3 * source + step] = static_cast<int64_t>(generator() % planes);
+    }
+  }
+  std::vector<double> edge(2 * planes);
+  int64_t cells = 0;
+  for (int64_t plane = 0; plane < planes; ++plane) {
+    const int64_t rows = one_of<int64_t>({1, 5, 40});
+    wide[plane] = one_of<int64_t>({1, 8, 30});
+    start[plane] = cells;
+    edge[2 * plane] = static_cast<double>(rows - 1);
+    edge[2 * plane + 1] = static_cast<double>(wide[plane] - 1);
+    cells += rows * wide[plane];
+  }
+  const auto surface = std::make_unique<bool[]>(cells);
+  for (int64_t cell = 0; cell < cells; ++cell) surface[cell] = chance(0.8f);
+  const auto asked = std::make_unique<bool[]>(sources);
+  for (int64_t source = 0; source < sources; ++source) asked[source] = chance(0.8f);
+  const WayPlan plan{chain.data(), sequence.data(), order.data(), last.data(), side.data(), normals.data(),
+                     offsets.data(), chance(0.7f) ? axes.data() : nullptr, low.data(), edge.data(), wide.data(),
+                     start.data(), surface.get(), sources, planes};
+  const bool* wanted = chance(0.5f) ? asked.get() : nullptr;
+  const auto once = fold_ways(plan, receivers.data(), count, wanted, 1);
+  const auto again = fold_ways(plan, receivers.data(), count, wanted, 3);
+  require(once.size() == again.size() &&
+              (once.empty() || std::memcmp(once.data(), again.data(), once.size() * sizeof(Way)) == 0),
+          "ways do not depend on the number of threads");
+  for (size_t at = 0; at < once.size(); ++at) {
+    require(once[at].place < static_cast<int64_t>(count) && once[at].source < sources, "no way is made up");
+    require(at == 0 || once[at - 1].place < once[at].place ||
+                (once[at - 1].place == once[at].place && once[at - 1].source < once[at].source),
+            "ways are sorted by receiver and source");
+    require(wanted == nullptr || wanted[once[at].source], "only sources that are asked have ways");
+  }
+}
+
 }  // namespace
 
 int main(int count, char** words) {
@@ -523,6 +575,7 @@ int main(int count, char** words) {
     trainer();
     sums_over_paths();
     segments();
+    ways();
     if (round_number % 10 == 0) pool();
     if (round_number % 25 == 5 && forks) fork_and_draw();
   }

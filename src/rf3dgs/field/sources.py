@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 ROUNDING = 1e-5  # of a cosine in float32
 MARK_PRIOR = 0.05  # weight of no deviation beside marks of weight 1 where they are
-MARK_REACH, NEAREST_MARKS = 5.0, 64  # widths: what is farther, or hidden behind so many nearer ones, weighs nothing
+MARK_REACH, NEAREST_MARKS = 5.0, 32  # widths: what is farther, or hidden behind so many nearer ones, weighs nothing
 PLANES_APART = 1e4  # m
 AT_ONCE = 256  # receivers
 

@@ -4,16 +4,20 @@ The straight line from the receiver to an image of the transmitter, folded back 
 a mirror path along a sequence of planes. Candidates are dropped as soon as they fail: first those whose image and
 receiver stand on one side of the last plane, then, from reflection to reflection, those that miss a plane's surface.
 What is left is a list of ways, so that the work goes with the candidates that live and not with receivers times
-sources. Everything is float64 and NumPy, whose calls on some dozen rows cost a fraction of torch's. What stands in the
-way is asked elsewhere.
+sources. Everything is float64. The native core does it in one call; without the core the specification, which is
+NumPy, answers itself. What stands in the way is asked elsewhere.
 """
 
 from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from rf3dgs.core.native import native_core
+from rf3dgs.core.threads import thread_count
 from rf3dgs.field.images import HIGHEST_ORDER
 from rf3dgs.geometry import Patches
 from rf3dgs.geometry.patches import closed
@@ -21,6 +25,7 @@ from rf3dgs.geometry.patches import closed
 NEAREST = 1e-6  # share of a leg below which an end lies on the plane itself
 SHORTEST = 1e-3  # m: nearer sources count as that far
 LEAST = 1e-12  # m: a leg that falls less towards a plane runs along it
+FEW = 128  # receivers that are answered sooner than other threads wake
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,12 +117,35 @@ class Plan:
         side = np.where(order > 0, _dot(images[:, -1], n[last]) - d[last], -1.0)
         return cls(images, rows, order, n, d, None if patches is None else Reach.of(patches), last, side)
 
+    @cached_property
+    def held(self) -> Any | None:
+        """The plan in the native core, or None without it."""
+        core, reach = native_core(), self.reach
+        if core is None:
+            return None
+        own = (self.chain, self.sequence, self.order, self.last, self.side, self.normals, self.offsets)
+        where = (None,) * 6
+        if reach is not None:
+            where = (reach.axes, reach.low, reach.last, reach.wide, reach.start, reach.cells)
+        return core.WayPlan(*(None if each is None else np.ascontiguousarray(each) for each in (*own, *where)))
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in self.__dict__.items() if name != "held"}
+
 
 def ways_over(plan: Plan, receivers: np.ndarray, asked: np.ndarray | None = None) -> Ways:
     """All ways of a plan to receivers `[n, 3]` [m] whose every point lies between its neighbours and on surface.
 
     `asked` `[K]`, where given, is False for sources that are left out.
     """
+    if plan.held is None:
+        return ways_reference(plan, receivers, asked)
+    threads = 1 if len(receivers) < FEW else thread_count()
+    return Ways(*plan.held.fold(np.ascontiguousarray(receivers), asked, threads))
+
+
+def ways_reference(plan: Plan, receivers: np.ndarray, asked: np.ndarray | None = None) -> Ways:
+    """The specification of `ways_over`."""
     height = receivers @ plan.normals.T - plan.offsets
     facing = height[:, plan.last] * plan.side < 0.0
     place, source = np.nonzero(facing if asked is None else facing & asked)
