@@ -14,7 +14,7 @@ from rf3dgs.core.grids import equirect_grid, pinhole_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.field.images import image_chain, mirrored, sequences
 from rf3dgs.field.rays import RAY_FIELDS
-from rf3dgs.field.sources import Marks, PointSources
+from rf3dgs.field.sources import RIPPLE, Marks, PointSources
 from rf3dgs.field.ways import Reach
 from rf3dgs.geometry import Patches, Planes
 from rf3dgs.geometry.patches import plane_axes
@@ -291,6 +291,20 @@ def test_a_mark_changes_the_reflection_where_it_is():
     assert 9.0 < float(gained[1]) <= 10.0
     far = torch.tensor([1.5, 1.5, 0.6])
     torch.testing.assert_close(marked.rays(far, FREE).power, plain.rays(far, FREE).power, rtol=1e-3, atol=0)
+
+
+def test_a_ripple_changes_the_reflection_by_the_angle():
+    floor = Planes(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1))
+    plain = PointSources(TX, FREQUENCY, floor, None, sequences(1, 1), torch.tensor([[-20.0, 0.0, 0.0]]))
+    ripple = 8.0 * torch.linspace(0, 1, RIPPLE)[None]
+    rippled = replace(plain, ripple=ripple)
+    for here in (torch.tensor([4.0, 3.0, 1.4]), torch.tensor([1.2, 1.3, 0.6]), torch.tensor([30.0, 3.0, 0.1])):
+        before, after = plain.rays(here, FREE), rippled.rays(here, FREE)
+        gained = 10 * torch.log10(after.power / before.power)
+        assert float(gained[0]) == 0.0
+        assert float(gained[1]) == pytest.approx(8.0 * abs(float(before.departure[1, 2])), abs=1e-3)
+    with pytest.raises(InputError, match=r"ripple must be \[1, 81\], a row a plane; got \[1, 5\]"):
+        replace(plain, ripple=torch.zeros(1, 5))
 
 
 def test_no_reflection_gains_power():

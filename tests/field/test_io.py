@@ -9,7 +9,7 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.field.images import sequences
 from rf3dgs.field.io import load_field, save_field
 from rf3dgs.field.radio_field import RadioField
-from rf3dgs.field.sources import Marks, PointSources
+from rf3dgs.field.sources import RIPPLE, Marks, PointSources
 from rf3dgs.geometry import Patches, Planes
 
 HERE = Pose([4.0, 3.0, 1.4])
@@ -57,6 +57,7 @@ def test_mirrors_come_back_from_disk_and_give_the_same_rays(field, tmp_path):
         level_db=0.5,
         open_above=0.2,
         marks=marks,
+        ripple=torch.linspace(-3, 3, 2 * RIPPLE).reshape(2, RIPPLE),
     )
     plane_of = torch.where(field.surface.means[:, 2].abs() < 0.01, 0, -1)
     mirrors = replace(field, sources=sources, plane_of=plane_of)

@@ -15,7 +15,7 @@ from rf3dgs.core.grids import equirect_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT
 from rf3dgs.field.images import sequences
 from rf3dgs.field.rays import RAY_FIELDS, Rays
-from rf3dgs.field.sources import PointSources
+from rf3dgs.field.sources import RIPPLE, PointSources
 from rf3dgs.geometry import Patches, Planes, Surfaces
 from rf3dgs.geometry.patches import surface_points
 from rf3dgs.propagation.room import shoebox
@@ -23,6 +23,7 @@ from rf3dgs.propagation.sites.shapes import box
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Instrument, Spectrum
 from rf3dgs.splats.gaussians import Gaussians
+from rf3dgs.splats.harmonics import C0
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.splats.surface import sample_mesh
 from rf3dgs.training.config import SourceConfig
@@ -370,10 +371,10 @@ def test_a_door_in_a_wall_is_marked():
     door = (found.plane[:, 0] == 3) & (found.point[:, 0, 0] > 4.5)
     louder = replace(found, level_db=found.level_db + 12.0 * door)
     reflection = fit_reflection(louder, 6)
-    marks = fit_marks(louder, reflection, fit.sources.planes, fit.sources.patches)
+    marks, ripple = fit_marks(louder, reflection, fit.sources.planes, fit.sources.patches)
     assert marks is not None
-    sources = replace(fit.sources, reflection=reflection, marks=marks)
-    plain = replace(sources, marks=None)
+    sources = replace(fit.sources, reflection=reflection, marks=marks, ripple=ripple)
+    plain = replace(sources, marks=None, ripple=None)
     wall = louder.alone & louder.seen & (louder.plane[:, 0] == 3)
     source = found.source[wall].numpy()
     cosine, points = found.cosine[wall].numpy(), found.point[wall].double().numpy()
@@ -385,12 +386,16 @@ def test_a_door_in_a_wall_is_marked():
     assert errors[0] < 0.5 * errors[1]
 
 
-def test_marks_end_where_colours_do():
-    """Peaks on a door and on its wall, far apart: a place between them goes with what it looks like."""
+@pytest.mark.parametrize("wood", [(1.0, 0.0, -1.0), (-1.5, -1.5, -1.5)])
+def test_marks_end_where_looks_do(wood):
+    """Peaks on a grey door and on its wall, far apart: a place between them goes with what it looks like, however the
+    light falls."""
     generator = torch.Generator().manual_seed(6)
     spots = torch.rand(4000, 3, generator=generator) * torch.tensor([9.0, 0.0, 3.0])
     door = spots[:, 0] > 5.0
-    sh = torch.where(door[:, None, None], torch.tensor(1.0), torch.tensor(-1.0)).expand(-1, 1, 3)
+    colour = 0.5 + C0 * torch.where(door[:, None], torch.ones(3), torch.tensor(wood))
+    lamp = 0.8 + 0.2 * torch.cos(spots[:, :1])
+    sh = ((colour * lamp - 0.5) / C0)[:, None]
     quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(4000, 4)
     shape = (spots, quats, torch.full((4000, 3), -3.0), torch.full((4000,), 3.0), sh)
     paint = Paint.of(Gaussians(*shape), torch.zeros(4000, dtype=torch.long))
@@ -398,12 +403,33 @@ def test_marks_end_where_colours_do():
     places = torch.rand(24, 3, generator=generator) * torch.tensor([9.0, 0.0, 3.0])
     places = places[(places[:, 0] - 5.0).abs() > 1.0]
     found = peaks_at(places, torch.where(places[:, 0] > 5.0, 2.0, -10.0))
-    marks = fit_marks(found, torch.tensor([[-10.0, 0.0, 0.0]]), planes, Patches.of(planes, [spots]), paint)
+    marks, _ = fit_marks(found, torch.tensor([[-10.0, 0.0, 0.0]]), planes, Patches.of(planes, [spots]), paint)
     assert marks is not None
     beside = np.array([[5.5, 0.0, 1.5], [4.5, 0.0, 1.5]])  # two brushes from the edge
     at_door, at_wall = marks.at(beside, np.zeros(2, dtype=np.int64)).tolist()
     assert at_door > 8.0
     assert abs(at_wall) < 2.0
+
+
+def test_a_level_that_comes_and_goes_with_the_angle_is_a_ripple():
+    """A thin layer: the level swings by 3 dB while the cosine changes by 0.15, the same all over the plane."""
+    generator = torch.Generator().manual_seed(7)
+    spots = torch.rand(4000, 3, generator=generator) * torch.tensor([9.0, 0.0, 3.0])
+    planes = Planes(torch.tensor([[0.0, 1.0, 0.0]]), torch.zeros(1))
+    cosine = 0.2 + 0.7 * torch.rand(60, generator=generator, dtype=torch.float64)
+
+    def swing(cosine: torch.Tensor) -> torch.Tensor:
+        return 3.0 * torch.sin(2 * math.pi * cosine / 0.3)
+
+    found = replace(
+        peaks_at(spots[:60], -10.0 + swing(cosine)), cosine=torch.stack((cosine, *torch.ones(2, 60).double()), -1)
+    )
+    marks, ripple = fit_marks(found, torch.tensor([[-10.0, 0.0, 0.0]]), planes, Patches.of(planes, [spots]))
+    assert ripple is not None
+    inside = slice(20, 69)
+    wanted = swing(torch.linspace(0, 1, RIPPLE, dtype=torch.float64))
+    assert float((ripple[0].double() - wanted)[inside].abs().mean()) < 0.5
+    assert marks is None or float(marks.level_db.abs().mean()) < 1.0
 
 
 def peaks_at(places: torch.Tensor, level_db: torch.Tensor) -> Glints:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.errors import DataError
-from rf3dgs.field.sources import Marks, PointSources
+from rf3dgs.field.sources import RIPPLE, Marks, PointSources
 from rf3dgs.geometry import Patches, Planes
 
 KINDS = {
@@ -25,6 +25,7 @@ KINDS = {
     "mark_plane": torch.int16,
     "mark_level_db": torch.float32,
     "mirrors": torch.bool,
+    "ripple": torch.float32,
 }
 PREFIX = "source_"
 
@@ -43,6 +44,7 @@ def source_record(sources: PointSources | None) -> dict[str, Any] | None:
         "mark_width": 0.0 if sources.marks is None else sources.marks.width,
         "patches": sources.patches is not None,
         "mirrors": sources.mirrors is not None,
+        "ripple": sources.ripple is not None,
     }
 
 
@@ -60,6 +62,8 @@ def source_tensors(sources: PointSources | None) -> dict[str, Tensor]:
         tensors |= {f"patch_{name}": tensor for name, tensor in sources.patches.tensors().items()}
     if sources.mirrors is not None:
         tensors["mirrors"] = sources.mirrors
+    if sources.ripple is not None:
+        tensors["ripple"] = sources.ripple
     if sources.marks is not None:
         marks = sources.marks
         tensors |= {"mark_points": marks.points, "mark_plane": marks.plane, "mark_level_db": marks.level_db}
@@ -104,6 +108,8 @@ def sources_of(record: Any, tensors: Mapping[str, Tensor], frequency: float) -> 
         shapes |= {"mark_points": (marked, 3), "mark_plane": (marked,), "mark_level_db": (marked,)}
     if record.get("mirrors", False):  # of before transmitters could move, fields have none
         shapes |= {"mirrors": (planes,)}
+    if record.get("ripple", False):  # of before reflections could depend on more than a parabola, fields have none
+        shapes |= {"ripple": (planes, RIPPLE)}
     found = {name: _tensor(tensors, name, shape) for name, shape in shapes.items()}
     patches = None
     if record["patches"]:
@@ -131,6 +137,7 @@ def sources_of(record: Any, tensors: Mapping[str, Tensor], frequency: float) -> 
         open_above,
         marks,
         found.get("mirrors"),
+        found.get("ripple"),
     )
 
 

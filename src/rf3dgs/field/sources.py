@@ -29,6 +29,7 @@ ROUNDING = 1e-5  # of a cosine in float32
 MARK_PRIOR = 0.05  # weight of no deviation beside marks of weight 1 where they are
 MARK_REACH, NEAREST_MARKS = 5.0, 32  # widths: what is farther, or hidden behind so many nearer ones, weighs nothing
 PLANES_APART = 1e4  # m
+RIPPLE = 81  # cosines from 0 to 1 at which a ripple is kept
 AT_ONCE = 256  # receivers
 
 
@@ -79,7 +80,8 @@ class PointSources:
     sequence `[K, 3]`: the planes of each source in the order from the transmitter, -1 beyond the last; the first row is
     the line of sight, all -1. open_above: the transmittance of a leg above which a way is open. marks: where planes
     reflect otherwise, or None. mirrors `[P]`: False for planes that were found to mirror nothing, or None where nobody
-    knows; it decides in which planes images are sought for another transmitter.
+    knows; it decides in which planes images are sought for another transmitter. ripple `[P, RIPPLE]`: what is added to
+    10 log10 Gamma [dB] at cosines of incidence from 0 to 1, evenly spaced, or None.
     """
 
     tx: Tensor
@@ -92,9 +94,12 @@ class PointSources:
     open_above: float = 0.1
     marks: Marks | None = None
     mirrors: Tensor | None = None
+    ripple: Tensor | None = None
 
     def __post_init__(self) -> None:
         count = len(self.planes)
+        if self.ripple is not None and self.ripple.shape != (count, RIPPLE):
+            raise InputError(f"ripple must be [{count}, {RIPPLE}], a row a plane; got {list(self.ripple.shape)}")
         if self.tx.shape != (3,):
             raise InputError(f"tx must be three coordinates in metres; got {list(self.tx.shape)}")
         if self.reflection.shape != (count, 3):
@@ -159,6 +164,11 @@ class PointSources:
         planes = self.plan.sequence[source]
         laws = self._reflection[planes]  # -1 is the row behind the planes
         level_db = laws[..., 0] + cosine * (laws[..., 1] + cosine * laws[..., 2])
+        if self.ripple is not None:
+            place = cosine * (RIPPLE - 1)
+            below = np.minimum(place.astype(np.int64), RIPPLE - 2)
+            low, high = self._ripple[planes, below], self._ripple[planes, below + 1]
+            level_db += low + (place - below) * (high - low)
         if self.marks is not None:
             way, step = np.nonzero(planes >= 0)
             level_db[way, step] += self.marks.at(points[way, step], planes[way, step])
@@ -168,6 +178,12 @@ class PointSources:
     def _reflection(self) -> np.ndarray:
         """`reflection` and a row `[P + 1, 3]` that changes nothing, for no plane."""
         return torch.cat((self.reflection, self.reflection.new_zeros(1, 3))).double().numpy()
+
+    @cached_property
+    def _ripple(self) -> np.ndarray:
+        """`ripple` and a row `[P + 1, RIPPLE]` of zeros, for no plane."""
+        assert self.ripple is not None
+        return torch.cat((self.ripple, self.ripple.new_zeros(1, RIPPLE))).double().numpy()
 
     def transmittance(self, ways: Ways, receivers: np.ndarray, obstacles: Obstacles) -> np.ndarray:
         """Share `[w]` that passes on ways to `receivers` `[n, 3]` [m].

@@ -1,8 +1,9 @@
-"""Where planes reflect otherwise than their laws say: doors and windows in walls, told by peaks and by photographs.
+"""Where and at which angles planes reflect otherwise than their laws say: doors and windows in walls, told by peaks
+and by photographs, and the interference in thin layers, which comes and goes with the angle.
 
-What the peaks deviate from the laws is told apart into deviations at the places of their reflections by a Gaussian
-process: deviations of one plane are alike near each other and where the photographs show like colours. The result is
-painted onto a lattice over the plane.
+What the peaks deviate from the laws is told apart into deviations at the places and at the angles of their reflections
+by a Gaussian process. Deviations of one plane are alike near each other and where the photographs show like colours,
+and at like angles. The former are painted onto a lattice over the plane, the latter onto one of cosines.
 """
 
 from dataclasses import dataclass
@@ -11,23 +12,32 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.threads import on_threads
-from rf3dgs.field.sources import Marks
+from rf3dgs.field.sources import RIPPLE, Marks
 from rf3dgs.geometry import Patches, Planes
 from rf3dgs.geometry.patches import surface_points
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import C0
 from rf3dgs.training.reflection import Glints, law_levels
 
-ALIKE = ((0.3, 0.0), (0.8, 0.0), (2.0, 0.2))  # widths [m] and differences of colour that are tried; 0: any colour
+PLACES = ((0.3, 0.0), (0.8, 0.0), (2.0, 0.06))  # widths [m] and differences of looks that are tried; 0: any
+COSINES = (0.03, 0.06)  # of incidence: widths that are tried
 BRUSH = 0.25  # m over which colours are averaged
+DIM = 0.15  # red, green and blue together: darker colours are the greyer, the darker they are
+BRIGHTNESS = 0.12  # what a difference of brightness counts beside one of hue, for how bright a wall is depends on lamps
 LATTICE = 0.3  # m between marks
 LEAST_MARKS = 10  # peaks of one reflection
 WORTH_DB = 0.4
 LEAST_DB = 0.5  # of deviation that is painted
 DOUBTFUL_DB = 6.0
 MOST_DB = 25.0
-DEVIATION_DB, NOISE_DB = 8.0, 1.0  # standard deviations: of a place, and of a peak's level for each reflection
+DEVIATION_DB, RIPPLE_DB = 8.0, 4.0  # standard deviations: of a place, and of an angle
+NOISE_DB = 1.0  # of a peak's level for each reflection
 ROUNDS = 3
+NO_PLACE = (0.0, 0.0)
+TRIALS = [
+    (*place, cosine) for place in (NO_PLACE, *PLACES) for cosine in (0.0, *COSINES) if place != NO_PLACE or cosine
+]
+"""Of deviations by place and by angle."""
 MOST_PEAKS = 1500
 
 
@@ -49,25 +59,27 @@ class Paint:
         return cls(*(part.detach()[known] for part in parts))
 
     def at(self, points: Tensor, plane: Tensor) -> Tensor:
-        """Colours `[n, 3]` around points `[n, 3]` [m] of planes `[n]`; grey where nothing is painted."""
+        """Looks `[n, 4]` around points `[n, 3]` [m] of planes `[n]`: hue, the shares of red, green and blue, and
+        brightness times `BRIGHTNESS`; grey where nothing is painted."""
         result = torch.full((len(points), 3), 0.5)
 
         def painted(number: int) -> None:
             here, own = torch.nonzero(plane == number).squeeze(-1), self.plane == number
             near = torch.exp(-0.5 * torch.cdist(points[here], self.means[own]) ** 2 / BRUSH**2) * self.weight[own]
-            total = near.sum(-1, keepdim=True)
-            result[here] = torch.where(total > 1e-9, near @ self.colours[own] / total.clamp_min(1e-12), 0.5)
+            whole = near.sum(-1, keepdim=True)
+            result[here] = torch.where(whole > 1e-9, near @ self.colours[own] / whole.clamp_min(1e-12), 0.5)
 
         on_threads(painted, plane.unique().tolist())
-        return result
+        total = result.sum(-1, keepdim=True)
+        return torch.cat((result / total.clamp_min(DIM), BRIGHTNESS / 3 * total), -1)
 
 
 @dataclass(frozen=True, eq=False)
 class _Peaks:
-    """n peaks and their m reflections on planes that may have marks.
+    """n peaks and their m reflections on planes that may deviate.
 
-    miss `[n]`: what the laws lack [dB]. noise `[n]`: its variance. peak, plane `[m]`, point `[m, 3]` [m]: of each
-    reflection.
+    miss `[n]`: what the laws lack [dB]. noise `[n]`: its variance. peak, plane `[m]`, point `[m, 3]` [m], cosine `[m]`:
+    of each reflection.
     """
 
     miss: Tensor
@@ -75,16 +87,18 @@ class _Peaks:
     peak: Tensor
     plane: Tensor
     point: Tensor
+    cosine: Tensor
 
 
 def fit_marks(
     found: Glints, reflection: Tensor, planes: Planes, patches: Patches, paint: Paint | None = None
-) -> Marks | None:
-    """Where planes reflect otherwise than `reflection` `[P, 3]` says, or None where that predicts no plane better.
+) -> tuple[Marks | None, Tensor | None]:
+    """Where planes reflect otherwise than `reflection` `[P, 3]` says, and at which angles: the ripple `[P, RIPPLE]`
+    [dB]; None where that predicts no plane better.
 
-    A plane has marks if its peaks of one reflection are told `WORTH_DB` better by the other peaks than by none. How
-    near, and of how like a colour in `paint`, places are alike is for each plane what tells its peaks best. Deep losses
-    that hardly stand over their surroundings tell nothing.
+    A plane deviates if its peaks of one reflection are told `WORTH_DB` better by the other peaks than by none. How
+    near, and of how like looks in `paint`, places are alike, and how near angles, is for each plane what tells its
+    peaks best. Deep losses that hardly stand over their surroundings tell nothing.
     """
     miss = found.level_db - law_levels(found, reflection)
     doubtful = (miss < -DOUBTFUL_DB) & (found.level_db < found.limit_db + DOUBTFUL_DB)
@@ -94,64 +108,104 @@ def fit_marks(
     single = found.order == 1
     first = found.plane[single, 0]
     count = torch.bincount(first, minlength=len(reflection))
-    spread, gain = torch.zeros(len(reflection), 2), torch.zeros(len(reflection), dtype=torch.float64)
+    spread, gain = torch.zeros(len(reflection), 3), torch.zeros(len(reflection), dtype=torch.float64)
     peaks = _peaks(found, miss, count >= LEAST_MARKS)
-    for trial in ALIKE:
-        if trial[1] and (paint is None or not len(paint.means)):
-            continue
-        features = _features(peaks.point, peaks.plane, torch.tensor(trial).expand(len(reflection), 2), paint)
-        _, others = _explained(peaks, features)
-        gained = (miss.abs() - (miss - others).abs())[single]
-        mean = torch.zeros_like(gain).index_add_(0, first, gained) / count.clamp_min(1)
-        spread[mean > gain], gain = torch.tensor(trial), torch.maximum(gain, mean)
+
+    def gained(trial: Tensor) -> Tensor:
+        _, others = _explained(peaks, _features(peaks, trial.expand(len(reflection), 3), paint))
+        better = (miss.abs() - (miss - others).abs())[single]
+        return torch.zeros_like(gain).index_add_(0, first, better) / count.clamp_min(1)
+
+    painted = paint is not None and len(paint.means) > 0
+    trials = [torch.tensor(trial) for trial in TRIALS if painted or not trial[1]]
+    for trial, mean in zip(trials, on_threads(gained, trials), strict=True):
+        spread[mean > gain], gain = trial, torch.maximum(gain, mean)
     worth = (count >= LEAST_MARKS) & (gain > WORTH_DB)
     if not bool(worth.any()):
-        return None
+        return None, None
     peaks = _peaks(found, miss, worth)
-    features = _features(peaks.point, peaks.plane, spread, paint)
+    features = _features(peaks, spread, paint)
     share, _ = _explained(peaks, features)
+    ripple = torch.zeros(len(reflection), RIPPLE)
     parts, surface = [], surface_points(planes, patches)
     for number in torch.nonzero(worth).squeeze(-1).tolist():
-        places, own = _lattice(surface[number], patches.axes[number]), peaks.plane == number
-        here = _features(places, torch.full((len(places),), number), spread, paint)
-        level_db = _alike(here, features[own]) @ share[peaks.peak[own]]
-        loud = level_db.abs() > LEAST_DB  # and what is beside it, so that it ends there
-        kept = (torch.cdist(places, places[loud]) < 2 * LATTICE).any(-1)
-        parts.append((places[kept], torch.full((int(kept.sum()),), number), level_db[kept].float()))
-    where, plane, level_db = (torch.cat(column) for column in zip(*parts, strict=True))
-    return Marks(where, plane, level_db, LATTICE / 2)
+        own = peaks.plane == number
+        known, told = features.only(own), share[peaks.peak[own]]
+        if bool(spread[number, 2] > 0):
+            angles = torch.linspace(0, 1, RIPPLE, dtype=torch.float64) / spread[number, 2]
+            ripple[number] = (_alike(angles[:, None], known.angle, RIPPLE_DB) @ told).float()
+        if bool(spread[number, 0] > 0):
+            places = _lattice(surface[number], patches.axes[number])
+            here = _places(places, torch.full((len(places),), number), spread, paint)
+            level_db = _alike(here, known.place, DEVIATION_DB) @ told
+            loud = level_db.abs() > LEAST_DB  # and what is beside it, so that it ends there
+            kept = (torch.cdist(places, places[loud]) < 2 * LATTICE).any(-1)
+            parts.append((places[kept], torch.full((int(kept.sum()),), number), level_db[kept].float()))
+    where, plane, level_db = (torch.cat(column) for column in zip(*parts, strict=True)) if parts else (None,) * 3
+    marks = None if where is None or plane is None or level_db is None else Marks(where, plane, level_db, LATTICE / 2)
+    return marks, ripple if bool((spread[worth, 2] > 0).any()) else None
 
 
 def _peaks(found: Glints, miss: Tensor, marked: Tensor) -> _Peaks:
     """The peaks with their reflections on the planes that are `marked` `[P]`."""
     peak, step = torch.nonzero((found.plane >= 0) & marked[found.plane], as_tuple=True)
     noise = (NOISE_DB * found.order.double()) ** 2
-    return _Peaks(miss, noise, peak, found.plane[peak, step], found.point[peak, step])
+    at = peak, step
+    return _Peaks(miss, noise, peak, found.plane[at], found.point[at], found.cosine[at])
 
 
-def _features(point: Tensor, plane: Tensor, spread: Tensor, paint: Paint | None) -> Tensor:
-    """What makes places `[n, 3]` [m] of planes `[n]` alike, `[n, 6]`: where they are and how they look, in units of the
-    width [m] and the difference of colour of each plane, `spread` `[P, 2]`.
-    """
-    width, hue = spread[plane].clamp_min(1e-6).unbind(-1)
-    colours = torch.zeros_like(point)
+@dataclass(frozen=True, eq=False)
+class _Features:
+    """What makes m reflections alike: place `[m, 7]`, where they are and how they look, in units of the width [m] and
+    the difference of looks of each plane; angle `[m, 1]`, the cosine in units of its width. Where a plane does not
+    deviate by places, or not by angles, by_place or by_angle `[m]` is 0, else 1."""
+
+    place: Tensor
+    angle: Tensor
+    by_place: Tensor
+    by_angle: Tensor
+
+    def only(self, chosen: Tensor) -> "_Features":
+        """Some of them, by a mask or list."""
+        return _Features(self.place[chosen], self.angle[chosen], self.by_place[chosen], self.by_angle[chosen])
+
+
+def _features(peaks: _Peaks, spread: Tensor, paint: Paint | None) -> _Features:
+    """The features of the peaks' reflections by the widths of each plane, `spread` `[P, 3]`: [m], of looks, of
+    the cosine."""
+    width = spread[peaks.plane, 2]
+    angle = (peaks.cosine / width.clamp_min(1e-6)).double()[:, None]
+    by_place, by_angle = (spread[peaks.plane][:, [0, 2]] > 0).double().unbind(-1)
+    return _Features(_places(peaks.point, peaks.plane, spread, paint), angle, by_place, by_angle)
+
+
+def _places(point: Tensor, plane: Tensor, spread: Tensor, paint: Paint | None) -> Tensor:
+    """`_Features.place` of places `[n, 3]` [m] of planes `[n]`."""
+    width, unlike = spread[plane, :2].clamp_min(1e-6).unbind(-1)
+    looks = torch.zeros(len(point), 4)
     if paint is not None:
-        colours = torch.where((spread[plane, 1] > 0)[:, None], paint.at(point, plane) / hue[:, None], 0.0)
-    return torch.cat((point / width[:, None], colours), -1).double()
+        looks = torch.where((spread[plane, 1] > 0)[:, None], paint.at(point, plane) / unlike[:, None], 0.0)
+    return torch.cat((point / width[:, None], looks), -1).double()
 
 
-def _alike(first: Tensor, second: Tensor) -> Tensor:
-    """The covariance `[n, m]` [dB^2] of deviations at places of one plane, of features `[n, 6]` and `[m, 6]`."""
-    return DEVIATION_DB**2 * torch.exp(-0.5 * torch.cdist(first, second) ** 2)
+def _alike(first: Tensor, second: Tensor, std_db: float) -> Tensor:
+    """The covariance `[n, m]` [dB^2] of deviations of one plane with features `[n, k]` and `[m, k]`."""
+    return std_db**2 * torch.exp(-0.5 * torch.cdist(first, second) ** 2)
 
 
-def _explained(peaks: _Peaks, features: Tensor) -> tuple[Tensor, Tensor]:
+def _together(features: _Features) -> Tensor:
+    """The covariance `[m, m]` [dB^2] of the deviations of reflections of one plane, of places and angles together."""
+    place = _alike(features.place, features.place, DEVIATION_DB) * features.by_place
+    return place + _alike(features.angle, features.angle, RIPPLE_DB) * features.by_angle
+
+
+def _explained(peaks: _Peaks, features: _Features) -> tuple[Tensor, Tensor]:
     """The weights `[n]` of the peaks in every deviation, and what the other peaks say of each `[n]` [dB]; robust."""
     together = torch.zeros(len(peaks.miss), len(peaks.miss), dtype=torch.float64)
     for plane in peaks.plane.unique().tolist():
         own = torch.nonzero(peaks.plane == plane).squeeze(-1)
         rows = peaks.peak[own]
-        together.index_put_((rows[:, None], rows), _alike(features[own], features[own]), accumulate=True)
+        together.index_put_((rows[:, None], rows), _together(features.only(own)), accumulate=True)
     noise, share, others = peaks.noise, peaks.miss, torch.zeros_like(peaks.miss)
     for _ in range(ROUNDS):
         inverse = torch.linalg.inv(together + torch.diag(noise))

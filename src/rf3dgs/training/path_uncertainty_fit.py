@@ -51,7 +51,8 @@ def sources_without(sources: PointSources | None, measured: Glints | None, place
         return sources
     some = measured.only(~torch.isin(measured.position, torch.tensor(places)))
     reflection = fit_reflection(some, len(sources.planes))
-    return replace(sources, reflection=reflection, marks=fit_marks(some, reflection, sources.planes, sources.patches))
+    marks, ripple = fit_marks(some, reflection, sources.planes, sources.patches)
+    return replace(sources, reflection=reflection, marks=marks, ripple=ripple)
 
 
 def known_places(measured: Glints | None, without: list[int]) -> PathDoubt:

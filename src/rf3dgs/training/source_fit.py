@@ -190,8 +190,8 @@ def _levelled(
     found = found.only(~dark[found.source])
     reflection = fit_reflection(found, len(sources.planes))
     assert sources.patches is not None
-    marks = fit_marks(found, reflection, sources.planes, sources.patches, paint)
-    return replace(sources, reflection=reflection, marks=marks), found
+    marks, ripple = fit_marks(found, reflection, sources.planes, sources.patches, paint)
+    return replace(sources, reflection=reflection, marks=marks, ripple=ripple), found
 
 
 def with_images(
