@@ -116,8 +116,8 @@ def fit_marks(
         better = (miss.abs() - (miss - others).abs())[single]
         return torch.zeros_like(gain).index_add_(0, first, better) / count.clamp_min(1)
 
-    painted = paint is not None and len(paint.means) > 0
-    trials = [torch.tensor(trial) for trial in TRIALS if painted or not trial[1]]
+    coloured = paint is not None and len(paint.means) > 0
+    trials = [torch.tensor(trial) for trial in TRIALS if coloured or not trial[1]]
     for trial, mean in zip(trials, on_threads(gained, trials), strict=True):
         spread[mean > gain], gain = trial, torch.maximum(gain, mean)
     worth = (count >= LEAST_MARKS) & (gain > WORTH_DB)
@@ -141,9 +141,11 @@ def fit_marks(
             loud = level_db.abs() > LEAST_DB  # and what is beside it, so that it ends there
             kept = (torch.cdist(places, places[loud]) < 2 * LATTICE).any(-1)
             parts.append((places[kept], torch.full((int(kept.sum()),), number), level_db[kept].float()))
-    where, plane, level_db = (torch.cat(column) for column in zip(*parts, strict=True)) if parts else (None,) * 3
-    marks = None if where is None or plane is None or level_db is None else Marks(where, plane, level_db, LATTICE / 2)
-    return marks, ripple if bool((spread[worth, 2] > 0).any()) else None
+    marks = None
+    if parts:
+        where, plane, level_db = (torch.cat(column) for column in zip(*parts, strict=True))
+        marks = Marks(where, plane, level_db, LATTICE / 2)
+    return marks, ripple if bool((spread[:, 2] > 0)[worth].any()) else None
 
 
 def _peaks(found: Glints, miss: Tensor, marked: Tensor) -> _Peaks:
