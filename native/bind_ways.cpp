@@ -2,7 +2,8 @@
 // converted.
 #include "ways/ways.hpp"
 
-#include <memory>
+#include <algorithm>
+#include <initializer_list>
 #include <vector>
 
 #include "bind.hpp"
@@ -41,7 +42,7 @@ struct HeldPlan {
   void check() const {
     const size_t sources = chain.shape(0), planes = offsets.shape(0) - 1;
     require(sequence.shape(0) == sources && order.shape(0) == sources && last.shape(0) == sources &&
-                side.shape(0) == sources && offsets.shape(0) > 0 && normals.shape(0) == planes + 1,
+                side.shape(0) == sources && normals.shape(0) == planes + 1,
             "all arrays need one row per source, and normals one per plane and one more");
     for (size_t source = 0; source < sources; ++source) {
       const int64_t steps = order.data()[source];

@@ -107,7 +107,7 @@ class RadioField:
         A point source that reaches the receiver gives its exact arrival, departure and delay D / c, and its gain; these
         come first. Places that are left are filled with peaks of the surface's spectrum: the gain of such a path is the
         power in the beam there, its delay and departure are those of the pixel. `parts="sources"` leaves the peaks out,
-        which takes less than a millisecond a pose. `coeff` is real and positive: the carrier's phase is the caller's
+        which takes about a millisecond a pose. `coeff` is real and positive: the carrier's phase is the caller's
         choice in `cfr` and `cir`. `order` is the number of reflections of a point source and 1 for a peak of the
         surface, whose number of bounces a field does not know; `kind` tells them apart: 0 the line of sight, 1
         mirrors, 2 the surface.

@@ -2,7 +2,7 @@
 and by photographs, and the interference in thin layers, which comes and goes with the angle.
 
 What the peaks deviate from the laws is told apart into deviations at the places and at the angles of their reflections
-by a Gaussian process. Deviations of one plane are alike near each other and where the photographs show like colours,
+by a Gaussian process. Deviations of one plane are alike near each other and where the photographs show like hues,
 and at like angles. The former are painted onto a lattice over the plane, the latter onto one of cosines.
 """
 
