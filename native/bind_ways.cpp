@@ -1,12 +1,15 @@
-// What Python sees of the folding of ways: arrays are float64, int64 and bool, C-contiguous, on the CPU and never
-// converted.
+// What Python sees of the folding of ways, of their reflections and of their polarisation: arrays are float64, int64 and
+// bool, C-contiguous, on the CPU and never converted.
 #include "ways/ways.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <initializer_list>
 #include <vector>
 
 #include "bind.hpp"
+#include "ways/polarisation.hpp"
+#include "ways/reflections.hpp"
 
 namespace rf3dgs {
 namespace {
@@ -19,6 +22,7 @@ template <int... Shape>
 using Doubles = Array<double, Shape...>;
 template <int... Shape>
 using Numbers = Array<int64_t, Shape...>;
+using Result = nb::ndarray<double, nb::shape<-1>, nb::c_contig, nb::device::cpu>;
 
 // The arrays of field.ways.Plan and of its Reach, kept as long as they are asked.
 struct HeldPlan {
@@ -107,6 +111,69 @@ nb::tuple fold(const HeldPlan& held, Doubles<-1, 3> receivers, std::optional<Arr
                         column<double>(ways, {3}, [](const Way& way) { return &way.departure[0]; }));
 }
 
+// The arrays of field.reflections.Reflections, kept as long as they are asked.
+struct HeldReflections {
+  Doubles<-1, 3> laws;
+  Doubles<-1, kRipple> ripple;
+  Doubles<-1, 3> marks;
+  Doubles<-1> along, level_db;
+  Numbers<-1> start;
+  double width;
+
+  int64_t planes() const { return static_cast<int64_t>(laws.shape(0)); }
+
+  ReflectionTable table() const {
+    return {laws.data(), ripple.data(), marks.data(), along.data(), level_db.data(), start.data(), width};
+  }
+
+  void check() const {
+    const size_t count = marks.shape(0);
+    require(ripple.shape(0) == laws.shape(0) && start.shape(0) == laws.shape(0) + 1,
+            "laws and ripple need one row per plane, and start one more");
+    require(along.shape(0) == count && level_db.shape(0) == count, "marks need one row per mark");
+    const int64_t* first = start.data();
+    require(first[0] == 0 && first[planes()] == static_cast<int64_t>(count) &&
+                std::is_sorted(first, first + planes() + 1),
+            "marks are sorted by plane, from the first to the last");
+    require(width > 0.0 && std::isfinite(width), "the width of marks is a length");
+  }
+};
+
+void sum_of(const HeldReflections& held, Numbers<-1, kMostReflections> planes, Doubles<-1, kMostReflections> cosine,
+            Doubles<-1, kMostReflections, 3> points, Result sum_db, int threads) {
+  const size_t count = planes.shape(0);
+  require(cosine.shape(0) == count && points.shape(0) == count && sum_db.shape(0) == count,
+          "all arrays need one row per way");
+  const int64_t* plane = planes.data();
+  require(std::all_of(plane, plane + kMostReflections * count,
+                      [&](int64_t each) { return each >= -1 && each < held.planes(); }),
+          "a way is reflected at planes that there are");
+  const ReflectionTable table = held.table();
+  nb::gil_scoped_release released;
+  reflect(table, plane, cosine.data(), points.data(), count, threads, sum_db.data());
+}
+
+// The arrays of field.polarisation.Slabs, kept as long as they are asked.
+struct HeldSlabs {
+  Doubles<-1, 3> normals, slabs;
+
+  int64_t planes() const { return static_cast<int64_t>(normals.shape(0)); }
+};
+
+void kept_of(const HeldSlabs& held, Numbers<-1, kMostReflections> planes, Doubles<-1, kMostReflections> cosine,
+             Doubles<-1, 3> departure, Result kept_db, int threads) {
+  const size_t count = planes.shape(0);
+  require(cosine.shape(0) == count && departure.shape(0) == count && kept_db.shape(0) == count,
+          "all arrays need one row per way");
+  const int64_t* plane = planes.data();
+  require(std::all_of(plane, plane + kMostReflections * count,
+                      [&](int64_t each) { return each >= -1 && each < held.planes(); }),
+          "a way is reflected at planes that there are");
+  const SlabTable table{held.normals.data(), held.slabs.data()};
+  nb::gil_scoped_release released;
+  keep(table, plane, cosine.data(), departure.data(), count, threads, kept_db.data());
+}
+
 }  // namespace
 
 void bind_ways(nb::module_& m) {
@@ -127,6 +194,29 @@ void bind_ways(nb::module_& m) {
           "low"_a.noconvert().none(), "edge"_a.noconvert().none(), "wide"_a.noconvert().none(),
           "start"_a.noconvert().none(), "cells"_a.noconvert().none())
       .def("fold", &fold, "receivers"_a.noconvert(), "asked"_a.noconvert().none(), "threads"_a);
+  nb::class_<HeldReflections>(m, "Reflections", "What planes take from the power of ways.")
+      .def(
+          "__init__",
+          [](HeldReflections* self, Doubles<-1, 3> laws, Doubles<-1, kRipple> ripple, Doubles<-1, 3> marks,
+             Doubles<-1> along, Doubles<-1> level_db, Numbers<-1> start, double width) {
+            HeldReflections made{laws, ripple, marks, along, level_db, start, width};
+            made.check();
+            new (self) HeldReflections(std::move(made));
+          },
+          "laws"_a.noconvert(), "ripple"_a.noconvert(), "marks"_a.noconvert(), "along"_a.noconvert(),
+          "level_db"_a.noconvert(), "start"_a.noconvert(), "width"_a)
+      .def("sum_db", &sum_of, "planes"_a.noconvert(), "cosine"_a.noconvert(), "points"_a.noconvert(),
+           "out"_a.noconvert(), "threads"_a);
+  nb::class_<HeldSlabs>(m, "Slabs", "What planes do to the polarisation of ways.")
+      .def(
+          "__init__",
+          [](HeldSlabs* self, Doubles<-1, 3> normals, Doubles<-1, 3> slabs) {
+            require(slabs.shape(0) == normals.shape(0), "normals and slabs need one row per plane");
+            new (self) HeldSlabs{normals, slabs};
+          },
+          "normals"_a.noconvert(), "slabs"_a.noconvert())
+      .def("kept_db", &kept_of, "planes"_a.noconvert(), "cosine"_a.noconvert(), "departure"_a.noconvert(),
+           "out"_a.noconvert(), "threads"_a);
 }
 
 }  // namespace rf3dgs

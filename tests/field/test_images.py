@@ -14,7 +14,8 @@ from rf3dgs.core.grids import equirect_grid, pinhole_grid
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.field.images import image_chain, mirrored, sequences
 from rf3dgs.field.rays import RAY_FIELDS
-from rf3dgs.field.sources import RIPPLE, Marks, PointSources
+from rf3dgs.field.reflections import RIPPLE, Marks
+from rf3dgs.field.sources import PointSources
 from rf3dgs.field.ways import Reach
 from rf3dgs.geometry import Patches, Planes
 from rf3dgs.geometry.patches import plane_axes

@@ -9,7 +9,8 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.field.images import sequences
 from rf3dgs.field.io import load_field, save_field
 from rf3dgs.field.radio_field import RadioField
-from rf3dgs.field.sources import RIPPLE, Marks, PointSources
+from rf3dgs.field.reflections import RIPPLE, Marks
+from rf3dgs.field.sources import PointSources
 from rf3dgs.geometry import Patches, Planes
 
 HERE = Pose([4.0, 3.0, 1.4])

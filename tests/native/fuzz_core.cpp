@@ -30,6 +30,7 @@
 #include "splats/morton.hpp"
 #include "splats/rasterize.hpp"
 #include "splats/trainer.hpp"
+#include "ways/reflections.hpp"
 #include "ways/ways.hpp"
 
 using namespace rf3dgs;
@@ -511,14 +512,16 @@ void segments() {
   require(same_bits(once, again), "what passes does not depend on the number of threads");
 }
 
+// Doubles about zero, some of them spoilt.
+std::vector<double> drawn(size_t size, double spread) {
+  std::vector<double> values(size);
+  for (double& value : values) value = chance(0.02f) ? hostile() : spread * normal();
+  return values;
+}
+
 void ways() {
   const int64_t planes = one_of<int64_t>({1, 2, 6}), sources = one_of<int64_t>({1, 7, 40});
   const size_t count = one_of<size_t>({0, 1, 63, 65, 200});
-  const auto drawn = [](size_t size, double spread) {
-    std::vector<double> values(size);
-    for (double& value : values) value = chance(0.02f) ? hostile() : spread * normal();
-    return values;
-  };
   const auto chain = drawn(12 * sources, 5.0), normals = drawn(3 * (planes + 1), 1.0), offsets = drawn(planes + 1, 3.0);
   const auto side = drawn(sources, 3.0), axes = drawn(6 * planes, 5.0), low = drawn(2 * planes, 9.0);
   const auto receivers = drawn(3 * count, 5.0);
@@ -561,6 +564,28 @@ void ways() {
   }
 }
 
+void reflections() {
+  const int64_t planes = one_of<int64_t>({1, 2, 6}), marks = one_of<int64_t>({0, 1, 40, 900});
+  const size_t count = one_of<size_t>({0, 1, 63, 65, 300});
+  const auto laws = drawn(3 * planes, 5.0), ripple = drawn(kRipple * planes, 3.0);
+  const auto places = drawn(3 * marks, 2.0), along = drawn(marks, 2.0);
+  const auto level_db = drawn(marks, 9.0), cosine = drawn(kMostReflections * count, 0.5);
+  const auto points = drawn(3 * kMostReflections * count, 2.0);
+  std::vector<int64_t> start(planes + 1, 0), met(kMostReflections * count);
+  for (int64_t plane = 1; plane < planes; ++plane) start[plane] = static_cast<int64_t>(generator() % (marks + 1));
+  start[planes] = marks;
+  std::sort(start.begin(), start.end());
+  for (int64_t& plane : met) plane = static_cast<int64_t>(generator() % (planes + 1)) - 1;
+  const ReflectionTable table{laws.data(),     ripple.data(), places.data(), along.data(),
+                              level_db.data(), start.data(),  one_of({1e-300, 0.15, 3.0, 1e300})};
+  std::vector<double> once(count), again(count);
+  reflect(table, met.data(), cosine.data(), points.data(), count, 1, once.data());
+  reflect(table, met.data(), cosine.data(), points.data(), count, 3, again.data());
+  require(count == 0 || std::memcmp(once.data(), again.data(), count * sizeof(double)) == 0,
+          "reflections do not depend on the number of threads");
+  for (const double sum_db : once) require(!(sum_db > 0.0), "no reflection gains power");
+}
+
 }  // namespace
 
 int main(int count, char** words) {
@@ -576,6 +601,7 @@ int main(int count, char** words) {
     sums_over_paths();
     segments();
     ways();
+    reflections();
     if (round_number % 10 == 0) pool();
     if (round_number % 25 == 5 && forks) fork_and_draw();
   }

@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
@@ -27,9 +26,18 @@ from rf3dgs.splats.harmonics import C0
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.splats.surface import sample_mesh
 from rf3dgs.training.config import SourceConfig
-from rf3dgs.training.marks import Paint, fit_marks
+from rf3dgs.training.marks import Paint, fit_deviations
 from rf3dgs.training.radio_views import ruled
-from rf3dgs.training.reflection import Glints, fit_reflection, glints, on_time, outshone, ray_powers, silent_planes
+from rf3dgs.training.reflection import (
+    Glints,
+    expected_db,
+    fit_reflection,
+    glints,
+    on_time,
+    outshone,
+    ray_powers,
+    silent_planes,
+)
 from rf3dgs.training.source_fit import USUAL, USUAL_OF_MESHES, _gated, fit_sources
 from rf3dgs.training.timed_mirrors import timed_mirrors, with_timed
 from rf3dgs.training.virtual import Mirror, peaks_of
@@ -371,17 +379,13 @@ def test_a_door_in_a_wall_is_marked():
     door = (found.plane[:, 0] == 3) & (found.point[:, 0, 0] > 4.5)
     louder = replace(found, level_db=found.level_db + 12.0 * door)
     reflection = fit_reflection(louder, 6)
-    marks, ripple = fit_marks(louder, reflection, fit.sources.planes, fit.sources.patches)
+    plain = replace(fit.sources, reflection=reflection, marks=None, ripple=None, slabs=None)
+    marks, ripple = fit_deviations(louder, plain)
     assert marks is not None
-    sources = replace(fit.sources, reflection=reflection, marks=marks, ripple=ripple)
-    plain = replace(sources, marks=None, ripple=None)
+    sources = replace(plain, marks=marks, ripple=ripple)
     wall = louder.alone & louder.seen & (louder.plane[:, 0] == 3)
-    source = found.source[wall].numpy()
-    cosine, points = found.cosine[wall].numpy(), found.point[wall].double().numpy()
-    measured_db = louder.level_db[wall].double().numpy()
-    errors = [
-        float(np.median(np.abs(one.reflection_db(source, cosine, points) - measured_db))) for one in (sources, plain)
-    ]
+    peaks = louder.only(wall)
+    errors = [float((expected_db(peaks, one) - peaks.level_db).abs().median()) for one in (sources, plain)]
     assert errors[0] < 1.0
     assert errors[0] < 0.5 * errors[1]
 
@@ -403,11 +407,12 @@ def test_marks_end_where_looks_do(wood):
     places = torch.rand(24, 3, generator=generator) * torch.tensor([9.0, 0.0, 3.0])
     places = places[(places[:, 0] - 5.0).abs() > 1.0]
     found = peaks_at(places, torch.where(places[:, 0] > 5.0, 2.0, -10.0))
-    marks, ripple = fit_marks(found, torch.tensor([[-10.0, 0.0, 0.0]]), planes, Patches.of(planes, [spots]), paint)
+    plain = one_plane(planes, spots)
+    marks, ripple = fit_deviations(found, plain, paint)
     assert marks is not None
-    beside = np.array([[5.5, 0.0, 1.5], [4.5, 0.0, 1.5]])  # two brushes from the edge
-    straight = 0.0 if ripple is None else float(ripple[0, -1])  # all peaks are of waves that fall straight on
-    at_door, at_wall = (marks.at(beside, np.zeros(2, dtype=np.int64)) + straight).tolist()
+    beside = torch.tensor([[5.5, 0.0, 1.5], [4.5, 0.0, 1.5]])  # two brushes from the edge
+    asked = peaks_at(beside, torch.zeros(2))
+    at_door, at_wall = (expected_db(asked, replace(plain, marks=marks, ripple=ripple)) + 10.0).tolist()
     assert at_door > 8.0
     assert abs(at_wall) < 2.0
 
@@ -425,7 +430,7 @@ def test_a_level_that_comes_and_goes_with_the_angle_is_a_ripple():
     found = replace(
         peaks_at(spots[:60], -10.0 + swing(cosine)), cosine=torch.stack((cosine, *torch.ones(2, 60).double()), -1)
     )
-    marks, ripple = fit_marks(found, torch.tensor([[-10.0, 0.0, 0.0]]), planes, Patches.of(planes, [spots]))
+    marks, ripple = fit_deviations(found, one_plane(planes, spots))
     assert ripple is not None
     inside = slice(20, 69)
     wanted = swing(torch.linspace(0, 1, RIPPLE, dtype=torch.float64))
@@ -441,7 +446,14 @@ def peaks_at(places: torch.Tensor, level_db: torch.Tensor) -> Glints:
     plane = torch.cat((zeros[:, None], none), -1)
     levels = (level_db.double(), torch.full((count,), -60.0).double())
     cosine = torch.ones(count, 3, dtype=torch.float64)
-    return Glints(torch.arange(count), zeros, plane, places[:, None].expand(-1, 3, 3), cosine, *levels, yes, yes)
+    point, departure = places[:, None].expand(-1, 3, 3), torch.tensor([0.0, -1.0, 0.0]).expand(count, 3)
+    return Glints(torch.arange(count), zeros, plane, point, cosine, departure, *levels, yes, yes)
+
+
+def one_plane(planes: Planes, spots: torch.Tensor) -> PointSources:
+    """One plane with surface around `spots` `[n, 3]`, which takes 10 dB of what it reflects."""
+    rows, law = torch.tensor([[-1, -1, -1], [0, -1, -1]]), torch.tensor([[-10.0, 0.0, 0.0]])
+    return PointSources(TX, FREQUENCY, planes, Patches.of(planes, [spots]), rows, law)
 
 
 def test_a_law_is_that_of_most_of_a_plane_not_of_where_most_look():

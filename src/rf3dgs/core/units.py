@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact
+VACUUM_PERMITTIVITY = 8.8541878128e-12  # [F/m]
 LONGEST_DELAY = 1e-3  # [s], the way of light over 300 km; what lies beyond is in another unit
 Distance = TypeVar("Distance", float, np.ndarray)
 Length = TypeVar("Length", np.ndarray, Tensor)

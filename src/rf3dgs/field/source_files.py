@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.errors import DataError
-from rf3dgs.field.sources import RIPPLE, Marks, PointSources
+from rf3dgs.field.reflections import RIPPLE, Marks
+from rf3dgs.field.sources import PointSources
 from rf3dgs.geometry import Patches, Planes
 
 KINDS = {
@@ -26,6 +27,7 @@ KINDS = {
     "mark_level_db": torch.float32,
     "mirrors": torch.bool,
     "ripple": torch.float32,
+    "slabs": torch.float32,
 }
 PREFIX = "source_"
 
@@ -45,6 +47,7 @@ def source_record(sources: PointSources | None) -> dict[str, Any] | None:
         "patches": sources.patches is not None,
         "mirrors": sources.mirrors is not None,
         "ripple": sources.ripple is not None,
+        "slabs": sources.slabs is not None,
     }
 
 
@@ -64,6 +67,8 @@ def source_tensors(sources: PointSources | None) -> dict[str, Tensor]:
         tensors["mirrors"] = sources.mirrors
     if sources.ripple is not None:
         tensors["ripple"] = sources.ripple
+    if sources.slabs is not None:
+        tensors["slabs"] = sources.slabs
     if sources.marks is not None:
         marks = sources.marks
         tensors |= {"mark_points": marks.points, "mark_plane": marks.plane, "mark_level_db": marks.level_db}
@@ -110,6 +115,8 @@ def sources_of(record: Any, tensors: Mapping[str, Tensor], frequency: float) -> 
         shapes |= {"mirrors": (planes,)}
     if record.get("ripple", False):  # of before reflections could depend on more than a parabola, fields have none
         shapes |= {"ripple": (planes, RIPPLE)}
+    if record.get("slabs", False):  # of before ways could keep polarisation, fields have none
+        shapes |= {"slabs": (planes, 3)}
     found = {name: _tensor(tensors, name, shape) for name, shape in shapes.items()}
     patches = None
     if record["patches"]:
@@ -138,6 +145,7 @@ def sources_of(record: Any, tensors: Mapping[str, Tensor], frequency: float) -> 
         marks,
         found.get("mirrors"),
         found.get("ripple"),
+        found.get("slabs"),
     )
 
 

@@ -8,7 +8,6 @@ receiver is decided by geometry: every reflection falls on surface, and every le
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,57 +16,15 @@ from torch import Tensor
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.units import SPEED_OF_LIGHT, friis_gain
 from rf3dgs.field.images import HIGHEST_ORDER, image_chain
+from rf3dgs.field.polarisation import Slabs, kept_db
 from rf3dgs.field.rays import RAY_FIELDS, Rays
+from rf3dgs.field.reflections import RIPPLE, Marks, Reflections, reflected_db
 from rf3dgs.field.ways import Plan, Ways, ways_over
 from rf3dgs.geometry import Patches, Planes
 from rf3dgs.splats.obstacles import Obstacles
 
-if TYPE_CHECKING:
-    from scipy.spatial import KDTree
-
 ROUNDING = 1e-5  # of a cosine in float32
-MARK_PRIOR = 0.05  # weight of no deviation beside marks of weight 1 where they are
-MARK_REACH, NEAREST_MARKS = 5.0, 32  # widths: what is farther, or hidden behind so many nearer ones, weighs nothing
-PLANES_APART = 1e4  # m
-RIPPLE = 81  # cosines from 0 to 1 at which a ripple is kept
 AT_ONCE = 256  # receivers
-
-
-@dataclass(frozen=True, eq=False)
-class Marks:
-    """Places on planes where the reflection was measured to be other than the plane's: doors and windows in walls.
-
-    points `[M, 3]` [m], plane `[M]`, level_db `[M]`: what is added to 10 log10 Gamma. width [m]: how far one reaches.
-    """
-
-    points: Tensor
-    plane: Tensor
-    level_db: Tensor
-    width: float
-
-    def at(self, points: np.ndarray, plane: np.ndarray) -> np.ndarray:
-        """What is added at points `[n, 3]` of planes `[n]` [dB]: the mean of near marks, drawn to 0 where few are."""
-        tree, level_db = self._tree
-        places = _of_planes(points, plane)
-        apart, mark = tree.query(places, NEAREST_MARKS, distance_upper_bound=MARK_REACH * self.width)
-        weight = np.exp(apart * apart * (-0.5 / self.width**2))  # 0 for those that are missing, infinitely far
-        return (weight * level_db[mark]).sum(-1) / (weight.sum(-1) + MARK_PRIOR)
-
-    @cached_property
-    def _tree(self) -> "tuple[KDTree, np.ndarray]":
-        """The marks by place and plane, and their levels with a zero behind the last, which stands for none."""
-        from scipy.spatial import KDTree
-
-        tree = KDTree(_of_planes(self.points.double().numpy(), self.plane.numpy()))
-        return tree, np.append(self.level_db.double().numpy(), 0.0)
-
-    def __getstate__(self) -> dict[str, object]:
-        return {name: value for name, value in self.__dict__.items() if name != "_tree"}
-
-
-def _of_planes(points: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """Points `[n, 3]` [m] with a fourth coordinate `[n, 4]`, in which planes are far from each other."""
-    return np.concatenate((points, PLANES_APART * plane[:, None]), -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +38,9 @@ class PointSources:
     the line of sight, all -1. open_above: the transmittance of a leg above which a way is open. marks: where planes
     reflect otherwise, or None. mirrors `[P]`: False for planes that were found to mirror nothing, or None where nobody
     knows; it decides in which planes images are sought for another transmitter. ripple `[P, RIPPLE]`: what is added to
-    10 log10 Gamma [dB] at cosines of incidence from 0 to 1, evenly spaced, or None.
+    10 log10 Gamma [dB] at cosines of incidence from 0 to 1, evenly spaced, or None. slabs `[P, 3]`: relative
+    permittivity, conductivity [S/m] and thickness [m] of each plane, which tell what it does to polarisation (not its
+    level), or None where all are like metal.
     """
 
     tx: Tensor
@@ -95,15 +54,25 @@ class PointSources:
     marks: Marks | None = None
     mirrors: Tensor | None = None
     ripple: Tensor | None = None
+    slabs: Tensor | None = None
 
     def __post_init__(self) -> None:
         count = len(self.planes)
         if self.ripple is not None and self.ripple.shape != (count, RIPPLE):
             raise InputError(f"ripple must be [{count}, {RIPPLE}], a row a plane; got {list(self.ripple.shape)}")
+        if self.slabs is not None and self.slabs.shape != (count, 3):
+            raise InputError(f"slabs must be [{count}, 3], a row a plane; got {list(self.slabs.shape)}")
+        if self.slabs is not None and not bool(((self.slabs >= 0) & (self.slabs[:, :1] >= 1)).all()):
+            raise InputError(
+                "slabs must have relative permittivities of 1 or more, and conductivities [S/m] and thicknesses [m] that "
+                f"are not negative; got {self.slabs.amin(0).tolist()} at least"
+            )
         if self.tx.shape != (3,):
             raise InputError(f"tx must be three coordinates in metres; got {list(self.tx.shape)}")
         if self.reflection.shape != (count, 3):
             raise InputError(f"reflection must be [{count}, 3], a row a plane; got {list(self.reflection.shape)}")
+        if self.marks is not None and bool(((self.marks.plane < 0) | (self.marks.plane >= count)).any()):
+            raise InputError(f"marks must be on planes below {count}; got {self.marks.plane.unique().tolist()}")
         if self.mirrors is not None and self.mirrors.shape != (count,):
             raise InputError(f"mirrors must be [{count}], one for each plane; got {list(self.mirrors.shape)}")
         rows = self.sequence
@@ -156,34 +125,25 @@ class PointSources:
 
     def gain(self, ways: Ways) -> np.ndarray:
         """Path gain `[w]`, linear, of open ways."""
-        level_db = self.level_db + self.reflection_db(ways.source, ways.cosine, ways.points)
+        planes = self.plan.sequence[ways.source]
+        level_db = self.level_db + self.reflected_db(planes, ways.cosine, ways.points, ways.departure)
         return friis_gain(ways.distance, self.frequency) * 10.0 ** (level_db / 10.0)
 
-    def reflection_db(self, source: np.ndarray, cosine: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Sum `[w]` of 10 log10 Gamma over reflections in `points` `[w, 3, 3]` at `cosine` `[w, 3]` of incidence."""
-        planes = self.plan.sequence[source]
-        laws = self._reflection[planes]  # -1 is the row behind the planes
-        level_db = laws[..., 0] + cosine * (laws[..., 1] + cosine * laws[..., 2])
-        if self.ripple is not None:
-            place = cosine * (RIPPLE - 1)
-            below = np.minimum(place.astype(np.int64), RIPPLE - 2)
-            low, high = self._ripple[planes, below], self._ripple[planes, below + 1]
-            level_db += low + (place - below) * (high - low)
-        if self.marks is not None:
-            way, step = np.nonzero(planes >= 0)
-            level_db[way, step] += self.marks.at(points[way, step], planes[way, step])
-        return np.minimum(level_db, 0.0).sum(-1)
+    def reflected_db(
+        self, planes: np.ndarray, cosine: np.ndarray, points: np.ndarray, departure: np.ndarray
+    ) -> np.ndarray:
+        """10 log10 of K prod Gamma `[w]` of ways that leave along `departure` `[w, 3]` and are reflected by `planes`
+        `[w, 3]`, -1 for none, in `points` `[w, 3, 3]` at `cosine` `[w, 3]` of incidence."""
+        level_db = reflected_db(self._reflections, planes, cosine, points)
+        return level_db if self._slabs is None else level_db + kept_db(self._slabs, planes, cosine, departure)
 
     @cached_property
-    def _reflection(self) -> np.ndarray:
-        """`reflection` and a row `[P + 1, 3]` that changes nothing, for no plane."""
-        return torch.cat((self.reflection, self.reflection.new_zeros(1, 3))).double().numpy()
+    def _slabs(self) -> Slabs | None:
+        return None if self.slabs is None else Slabs.of(self.planes.normals, self.slabs, self.frequency)
 
     @cached_property
-    def _ripple(self) -> np.ndarray:
-        """`ripple` and a row `[P + 1, RIPPLE]` of zeros, for no plane."""
-        assert self.ripple is not None
-        return torch.cat((self.ripple, self.ripple.new_zeros(1, RIPPLE))).double().numpy()
+    def _reflections(self) -> Reflections:
+        return Reflections.of(self.reflection, self.ripple, self.marks)
 
     def transmittance(self, ways: Ways, receivers: np.ndarray, obstacles: Obstacles) -> np.ndarray:
         """Share `[w]` that passes on ways to `receivers` `[n, 3]` [m].
@@ -192,8 +152,9 @@ class PointSources:
         Gaussians of the planes that a leg joins do not stand in its way.
         """
         longest = int(self.plan.order.max())
-        first = np.broadcast_to(self.plan.chain[0, 0], (len(ways), 1, 3))
-        stops = np.concatenate((first, ways.points[:, :longest], receivers[ways.place, None]), 1, dtype=np.float32)
+        stops = np.empty((len(ways), longest + 2, 3), dtype=np.float32)
+        stops[:, 0], stops[:, -1] = self.plan.chain[0, 0], receivers[ways.place]
+        stops[:, 1:-1] = ways.points[:, :longest]
         labels = np.full((len(ways), longest + 2), -1)
         labels[:, 1:-1] = self.plan.sequence[ways.source, :longest]
         known = obstacles.labels is not None

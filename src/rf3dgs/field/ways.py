@@ -51,7 +51,7 @@ class Ways:
     def only(self, chosen: np.ndarray) -> "Ways":
         """Some of the ways: `chosen` is a mask `[w]`."""
         rows = np.flatnonzero(chosen)
-        return Ways(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return Ways(*(getattr(self, field.name).take(rows, 0) for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,10 +19,10 @@ from rf3dgs.core.angles import angles_of, direction_of
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.units import SPEED_OF_LIGHT, wavelength
+from rf3dgs.propagation.fresnel import slab_coefficients
 from rf3dgs.propagation.sites.materials import permittivity
 
 WALLS = ("x low", "x high", "y low", "y high", "z low", "z high")
-VACUUM_PERMITTIVITY = 8.8541878128e-12  # [F/m]
 HIGHEST_ORDER = 60  # 295,241 images
 THICKNESS = 0.1  # [m], of walls given by the name of their material, as of objects of a scene
 _AT_ONCE = 2**21  # crossings of walls worked on at once
@@ -104,19 +104,12 @@ def shoebox(
 def slab_reflection(slab: Slab, cosine: Tensor, frequency: float) -> tuple[Tensor, Tensor]:
     """Reflection coefficients (TE, TM), complex128 `[*batch]`, at `cosine` of the angle of incidence `[*batch]`.
 
-    Rec. ITU-R P.2040-3, eqs. 37, 43 and 44: the faces of the slab reflect to and fro. The TM field is counted along
-    (TE direction) x (propagation) before and after, so that a perfect conductor has -1 (TE) and +1 (TM).
+    See `slab_coefficients`.
     """
-    loss = slab.conductivity / (2 * math.pi * frequency * VACUUM_PERMITTIVITY)
-    eta = complex(slab.permittivity, -loss)
-    cosine = cosine.to(torch.complex128)
-    root = torch.sqrt(eta - (1 - cosine**2))
-    faces = (cosine - root) / (cosine + root), (eta * cosine - root) / (eta * cosine + root)
-    if math.isinf(slab.thickness):
-        return faces
-    turn = torch.exp(-2j * (2 * math.pi * slab.thickness / wavelength(frequency)) * root)
-    te, tm = (face * (1 - turn) / (1 - face**2 * turn) for face in faces)
-    return te, tm
+    numbers = (
+        torch.tensor(each, dtype=torch.float64) for each in (slab.permittivity, slab.conductivity, slab.thickness)
+    )
+    return slab_coefficients(*numbers, cosine, frequency)
 
 
 def _images(order: int) -> Tensor:

@@ -35,8 +35,8 @@ class RadioConfig:
     """The mirror model alone: parts that are left out, to see what each brings; without visibility nothing casts a
     shadow and every way is open."""
     joint: int | None = None
-    """The mirror model alone: steps of joint refinement of the surface after the closed form, each on one training
-    position; None is 200, 0 leaves the closed form as it is."""
+    """The mirror model alone: steps of joint refinement of the surface after the closed form, each on two training
+    positions; None is 140, 0 leaves the closed form as it is."""
     uncertainty: bool = False
     """The mirror model alone: learn how far its levels may be off, by leaving training positions out in turn. It takes
     about three times as long as the rest."""

@@ -12,6 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from rf3dgs.core.threads import on_threads
 from rf3dgs.field.lit import CSI_HARMONICS, LARGEST_RESIDUAL_DB, LitSurface
 from rf3dgs.field.rays import Rays
 from rf3dgs.spectra.spectrum import Spectrum
@@ -21,6 +22,7 @@ from rf3dgs.training.joint_views import JointView, joint_views, misfit
 from rf3dgs.training.lit_fit import BAND, LAW_HIGH, LAW_LOW, LAW_SPREAD, OFF_DB, SHRINK, SOFT_DB
 from rf3dgs.training.lit_views import SOFT_NS, SOFT_TURN
 
+AT_ONCE = 2
 RATE = 0.06  # Adam's first step, in units of `SCALES`; it falls to zero
 CSI_UNIT = torch.tensor([SOFT_NS, SOFT_TURN, SOFT_TURN, SOFT_TURN])
 SCALES = {
@@ -84,7 +86,7 @@ def refine_jointly(
     residual: bool = True,
     backend: Backend = "auto",
 ) -> LitSurface:
-    """The surface after `steps` of Adam on the spectra `[position, row, col]`, one position a step.
+    """The surface after `steps` of Adam on the spectra `[position, row, col]`, `AT_ONCE` positions a step.
 
     rays: what reaches each position from point sources. The closed form's values are start and prior. Without
     `residual` only laws move. `seed` decides the order of positions.
@@ -95,12 +97,18 @@ def refine_jointly(
     moved = {name: torch.zeros_like(x).requires_grad_() for name, x in start.items() if name not in still}
     adam = torch.optim.Adam(list(moved.values()), lr=RATE)
     generator = torch.Generator().manual_seed(seed)
-    order = torch.cat([torch.randperm(len(views), generator=generator) for _ in range(1 + steps // len(views))])
-    for step, number in enumerate(order[:steps].tolist()):
-        adam.param_groups[0]["lr"] = RATE * (1 - step / steps)
-        adam.zero_grad()
+    rounds = 1 + steps * AT_ONCE // len(views)
+    order = torch.cat([torch.randperm(len(views), generator=generator) for _ in range(rounds)])
+
+    def slopes(number: int) -> tuple[Tensor, ...]:
         with torch.enable_grad():
-            loss_of(surface, start, moved, views[number], len(views), backend).backward()
+            loss = loss_of(surface, start, moved, views[number], len(views), backend)
+            return torch.autograd.grad(loss, list(moved.values()))
+
+    for step, numbers in enumerate(order[: steps * AT_ONCE].view(steps, AT_ONCE).tolist()):
+        adam.param_groups[0]["lr"] = RATE * (1 - step / steps)
+        for x, *parts in zip(moved.values(), *on_threads(slopes, numbers), strict=True):
+            x.grad = torch.stack(parts).mean(0)
         adam.step()
     found = {name: (start[name] + SCALES[name] * x).detach() for name, x in moved.items()}
     # Adam moves what has next to no gradient as well: a part that was left out stays so.

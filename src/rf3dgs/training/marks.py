@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from rf3dgs.core.threads import on_threads
-from rf3dgs.field.sources import RIPPLE, Marks
-from rf3dgs.geometry import Patches, Planes
+from rf3dgs.field.reflections import RIPPLE, Marks
+from rf3dgs.field.sources import PointSources
 from rf3dgs.geometry.patches import surface_points
 from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.harmonics import C0
-from rf3dgs.training.reflection import Glints, law_levels
+from rf3dgs.training.reflection import Glints, expected_db
 
 PLACES = ((0.3, 0.0), (0.8, 0.0), (2.0, 0.06))  # widths [m] and differences of looks that are tried; 0: any
 COSINES = (0.03, 0.06)  # of incidence: widths that are tried
@@ -78,8 +78,8 @@ class Paint:
 class _Peaks:
     """n peaks and their m reflections on planes that may deviate.
 
-    miss `[n]`: what the laws lack [dB]. noise `[n]`: its variance. peak, plane `[m]`, point `[m, 3]` [m], cosine `[m]`:
-    of each reflection.
+    miss `[n]`: what is expected of them lacks [dB]. noise `[n]`: its variance. peak, plane `[m]`, point `[m, 3]` [m],
+    cosine `[m]`, looks `[m, 4]`: of each reflection.
     """
 
     miss: Tensor
@@ -88,46 +88,55 @@ class _Peaks:
     plane: Tensor
     point: Tensor
     cosine: Tensor
+    looks: Tensor
+
+    def on(self, marked: Tensor) -> "_Peaks":
+        """The peaks with their reflections on the planes that are `marked` `[P]`."""
+        own = marked[self.plane]
+        reflections = (self.peak, self.plane, self.point, self.cosine, self.looks)
+        return _Peaks(self.miss, self.noise, *(each[own] for each in reflections))
 
 
-def fit_marks(
-    found: Glints, reflection: Tensor, planes: Planes, patches: Patches, paint: Paint | None = None
+def fit_deviations(
+    found: Glints, sources: PointSources, paint: Paint | None = None
 ) -> tuple[Marks | None, Tensor | None]:
-    """Where planes reflect otherwise than `reflection` `[P, 3]` says, and at which angles: the ripple `[P, RIPPLE]`
-    [dB]; None where that predicts no plane better.
+    """Where planes reflect otherwise than `sources` has it so far, and at which angles: a ripple `[P, RIPPLE]` [dB];
+    None where that predicts no plane better.
 
-    A plane deviates if its peaks of one reflection are told `WORTH_DB` better by the other peaks than by none. How
-    near, and of how like looks in `paint`, places are alike, and how near angles, is for each plane what tells its
-    peaks best. Deep losses that hardly stand over their surroundings tell nothing.
+    A plane deviates if its peaks are told `WORTH_DB` better by the other peaks than by none; those of two reflections
+    count half for each plane. How near, and of how like looks in `paint`, places are alike, and how near angles, is for
+    each plane what tells its peaks best. Deep losses that hardly stand over their surroundings tell nothing.
     """
-    miss = found.level_db - law_levels(found, reflection)
+    miss = found.level_db - expected_db(found, sources)
     doubtful = (miss < -DOUBTFUL_DB) & (found.level_db < found.limit_db + DOUBTFUL_DB)
     used = torch.nonzero(found.alone & found.seen & ~doubtful).squeeze(-1)
     used = used[found.order[used].argsort(stable=True)[:MOST_PEAKS]]
     found, miss = found.only(used), miss[used].clamp(-MOST_DB, MOST_DB)
-    single = found.order == 1
-    first = found.plane[single, 0]
-    count = torch.bincount(first, minlength=len(reflection))
-    spread, gain = torch.zeros(len(reflection), 3), torch.zeros(len(reflection), dtype=torch.float64)
-    peaks = _peaks(found, miss, count >= LEAST_MARKS)
+    planes = len(sources.planes)
+    enough = torch.bincount(found.plane[found.order == 1, 0], minlength=planes) >= LEAST_MARKS
+    peaks = _peaks(found, miss, paint).on(enough)
+    part = 1 / found.order.double()[peaks.peak]
+    weight = torch.zeros(planes, dtype=torch.float64).index_add_(0, peaks.plane, part)
+    spread, gain = torch.zeros(planes, 3), torch.zeros(planes, dtype=torch.float64)
 
     def gained(trial: Tensor) -> Tensor:
-        _, others = _explained(peaks, _features(peaks, trial.expand(len(reflection), 3), paint))
-        better = (miss.abs() - (miss - others).abs())[single]
-        return torch.zeros_like(gain).index_add_(0, first, better) / count.clamp_min(1)
+        _, others = _explained(peaks, _features(peaks, trial.expand(planes, 3)))
+        better = (miss.abs() - (miss - others).abs())[peaks.peak]
+        return torch.zeros_like(gain).index_add_(0, peaks.plane, part * better) / weight.clamp_min(1)
 
     coloured = paint is not None and len(paint.means) > 0
     trials = [torch.tensor(trial) for trial in TRIALS if coloured or not trial[1]]
     for trial, mean in zip(trials, on_threads(gained, trials), strict=True):
         spread[mean > gain], gain = trial, torch.maximum(gain, mean)
-    worth = (count >= LEAST_MARKS) & (gain > WORTH_DB)
+    worth = gain > WORTH_DB
     if not bool(worth.any()):
         return None, None
-    peaks = _peaks(found, miss, worth)
-    features = _features(peaks, spread, paint)
+    peaks = peaks.on(worth)
+    features = _features(peaks, spread)
     share, _ = _explained(peaks, features)
-    ripple = torch.zeros(len(reflection), RIPPLE)
-    parts, surface = [], surface_points(planes, patches)
+    assert sources.patches is not None
+    surface = surface_points(sources.planes, sources.patches)
+    ripple, parts = torch.zeros(planes, RIPPLE), []
     for number in torch.nonzero(worth).squeeze(-1).tolist():
         own = peaks.plane == number
         known, told = features.only(own), share[peaks.peak[own]]
@@ -135,12 +144,13 @@ def fit_marks(
             angles = torch.linspace(0, 1, RIPPLE, dtype=torch.float64) / spread[number, 2]
             ripple[number] = (_alike(angles[:, None], known.angle, RIPPLE_DB) @ told).float()
         if bool(spread[number, 0] > 0):
-            places = _lattice(surface[number], patches.axes[number])
-            here = _places(places, torch.full((len(places),), number), spread, paint)
-            level_db = _alike(here, known.place, DEVIATION_DB) @ told
+            places = _lattice(surface[number], sources.patches.axes[number])
+            plane = torch.full((len(places),), number)
+            looks = _looks(paint, places, plane)
+            level_db = _alike(_places(places, looks, spread[plane]), known.place, DEVIATION_DB) @ told
             loud = level_db.abs() > LEAST_DB  # and what is beside it, so that it ends there
             kept = (torch.cdist(places, places[loud]) < 2 * LATTICE).any(-1)
-            parts.append((places[kept], torch.full((int(kept.sum()),), number), level_db[kept].float()))
+            parts.append((places[kept], plane[kept], level_db[kept].float()))
     marks = None
     if parts:
         where, plane, level_db = (torch.cat(column) for column in zip(*parts, strict=True))
@@ -148,12 +158,17 @@ def fit_marks(
     return marks, ripple if bool((spread[:, 2] > 0)[worth].any()) else None
 
 
-def _peaks(found: Glints, miss: Tensor, marked: Tensor) -> _Peaks:
-    """The peaks with their reflections on the planes that are `marked` `[P]`."""
-    peak, step = torch.nonzero((found.plane >= 0) & marked[found.plane], as_tuple=True)
+def _peaks(found: Glints, miss: Tensor, paint: Paint | None) -> _Peaks:
+    """The peaks with all their reflections."""
+    at = peak, _ = torch.nonzero(found.plane >= 0, as_tuple=True)
     noise = (NOISE_DB * found.order.double()) ** 2
-    at = peak, step
-    return _Peaks(miss, noise, peak, found.plane[at], found.point[at], found.cosine[at])
+    point, plane = found.point[at], found.plane[at]
+    return _Peaks(miss, noise, peak, plane, point, found.cosine[at], _looks(paint, point, plane))
+
+
+def _looks(paint: Paint | None, point: Tensor, plane: Tensor) -> Tensor:
+    """`Paint.at`, or looks `[n, 4]` that are all alike."""
+    return torch.zeros(len(point), 4) if paint is None else paint.at(point, plane)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,22 +187,20 @@ class _Features:
         return _Features(self.place[chosen], self.angle[chosen], self.by_place[chosen], self.by_angle[chosen])
 
 
-def _features(peaks: _Peaks, spread: Tensor, paint: Paint | None) -> _Features:
+def _features(peaks: _Peaks, spread: Tensor) -> _Features:
     """The features of the peaks' reflections by the widths of each plane, `spread` `[P, 3]`: [m], of looks, of
     the cosine."""
-    width = spread[peaks.plane, 2]
-    angle = (peaks.cosine / width.clamp_min(1e-6)).double()[:, None]
-    by_place, by_angle = (spread[peaks.plane][:, [0, 2]] > 0).double().unbind(-1)
-    return _Features(_places(peaks.point, peaks.plane, spread, paint), angle, by_place, by_angle)
+    own = spread[peaks.plane]
+    angle = (peaks.cosine / own[:, 2].clamp_min(1e-6)).double()[:, None]
+    by_place, by_angle = (own[:, [0, 2]] > 0).double().unbind(-1)
+    return _Features(_places(peaks.point, peaks.looks, own), angle, by_place, by_angle)
 
 
-def _places(point: Tensor, plane: Tensor, spread: Tensor, paint: Paint | None) -> Tensor:
-    """`_Features.place` of places `[n, 3]` [m] of planes `[n]`."""
-    width, unlike = spread[plane, :2].clamp_min(1e-6).unbind(-1)
-    looks = torch.zeros(len(point), 4)
-    if paint is not None:
-        looks = torch.where((spread[plane, 1] > 0)[:, None], paint.at(point, plane) / unlike[:, None], 0.0)
-    return torch.cat((point / width[:, None], looks), -1).double()
+def _places(point: Tensor, looks: Tensor, spread: Tensor) -> Tensor:
+    """`_Features.place` of places `[n, 3]` [m] with looks `[n, 4]`, by the widths `[n, 3]` of their planes."""
+    width, unlike = spread[:, :2].clamp_min(1e-6).unbind(-1)
+    told = torch.where((spread[:, 1] > 0)[:, None], looks / unlike[:, None], 0.0)
+    return torch.cat((point / width[:, None], told), -1).double()
 
 
 def _alike(first: Tensor, second: Tensor, std_db: float) -> Tensor:

@@ -14,8 +14,8 @@ from rf3dgs.field.sources import PointSources
 from rf3dgs.field.uncertainty import NUMBERS, SHARES, Uncertainty, numbers_of
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.training.calibration import minimum
-from rf3dgs.training.marks import fit_marks
-from rf3dgs.training.reflection import Glints, fit_reflection, glints
+from rf3dgs.training.levels import fit_levels
+from rf3dgs.training.reflection import Glints, glints
 
 STRONGEST = 8  # paths of a position
 LEAST_WAYS = 24
@@ -50,9 +50,7 @@ def sources_without(sources: PointSources | None, measured: Glints | None, place
     if sources is None or measured is None or sources.patches is None:
         return sources
     some = measured.only(~torch.isin(measured.position, torch.tensor(places)))
-    reflection = fit_reflection(some, len(sources.planes))
-    marks, ripple = fit_marks(some, reflection, sources.planes, sources.patches)
-    return replace(sources, reflection=reflection, marks=marks, ripple=ripple)
+    return fit_levels(sources, some)
 
 
 def known_places(measured: Glints | None, without: list[int]) -> PathDoubt:

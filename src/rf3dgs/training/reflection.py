@@ -34,8 +34,8 @@ class Glints:
     """What was measured in the directions of images: n observations.
 
     position, source `[n]`: which. plane `[n, 3]`: the mirrors from the transmitter on, -1 beyond the last. point
-    `[n, 3, 3]`: where the reflections are [m]. cosine `[n, 3]` of incidence. level_db `[n]`: 10 log10 of what stands
-    out over Friis and the sources' level. limit_db `[n]`: what in the same measure a peak must exceed to be seen: the
+    `[n, 3, 3]`: where the reflections are [m]. cosine `[n, 3]` of incidence. departure `[n, 3]`: unit vectors from the
+    transmitter. level_db `[n]`: 10 log10 of what stands out over Friis and the sources' level. limit_db `[n]`: what in the same measure a peak must exceed to be seen: the
     level of the surroundings, or of another wave that arrives there. seen `[n]`: the peak stands 3 dB over its
     surroundings, and at the time of its way where the spectra have delays. alone `[n]`: no other ray arrives beside it.
     """
@@ -45,6 +45,7 @@ class Glints:
     plane: Tensor
     point: Tensor
     cosine: Tensor
+    departure: Tensor
     level_db: Tensor
     limit_db: Tensor
     seen: Tensor
@@ -85,7 +86,7 @@ def glints(sources: PointSources, rays: list[Rays], spectra: Spectrum) -> Glints
         stops = torch.cat((sources.tx.expand(len(one), 1, 3), one.points), 1)
         legs = torch.nn.functional.normalize(stops[:, 1:] - stops[:, :-1], dim=-1)
         cosine = (legs * sources.planes.normals[plane.clamp_min(0)]).sum(-1).abs().double()
-        columns = (torch.full_like(one.index, position), one.index, plane, one.points, cosine)
+        columns = (torch.full_like(one.index, position), one.index, plane, one.points, cosine, one.departure)
         levels = (_decibels(power / free), _decibels(limit / free), (power > ring) & timely, ~crowded)
         return [column[kept] for column in (*columns, *levels)]
 
@@ -93,7 +94,9 @@ def glints(sources: PointSources, rays: list[Rays], spectra: Spectrum) -> Glints
     if not parts:
         none, count = torch.zeros(0), torch.zeros(0, dtype=torch.long)
         rows, level = torch.zeros(0, 3), torch.zeros(0, dtype=torch.float64)
-        return Glints(count, count, rows.long(), torch.zeros(0, 3, 3), rows.double(), level, level, none > 0, none > 0)
+        return Glints(
+            count, count, rows.long(), torch.zeros(0, 3, 3), rows.double(), rows, level, level, none > 0, none > 0
+        )
     return Glints(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
@@ -231,6 +234,12 @@ def law_levels(found: Glints, reflection: Tensor) -> Tensor:
     """The levels `[n]` [dB] that laws `reflection` `[P, 3]` give the observations."""
     laws = torch.cat((reflection, reflection.new_zeros(1, 3))).double()[found.plane]
     return (laws[..., 0] + found.cosine * (laws[..., 1] + found.cosine * laws[..., 2])).clamp_max(0.0).sum(-1)
+
+
+def expected_db(found: Glints, sources: PointSources) -> Tensor:
+    """The levels `[n]` [dB] that the observations have by all that `sources` says of its planes."""
+    columns = (found.plane, found.cosine, found.point.double(), found.departure.double())
+    return torch.from_numpy(sources.reflected_db(*(column.numpy() for column in columns)))
 
 
 def silent_sources(found: Glints, reflection: Tensor, order: Tensor) -> Tensor:

@@ -17,8 +17,9 @@ from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
 from rf3dgs.training.consolidation import consolidated, oblique_planes, squared, walls_whole, with_skins
+from rf3dgs.training.levels import fit_levels
 from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
-from rf3dgs.training.marks import Paint, fit_marks
+from rf3dgs.training.marks import Paint
 from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_reflection, glints, silent_planes, silent_sources
 from rf3dgs.training.small_planes import flat_pieces, outlined, standing, with_both_faces
 from rf3dgs.training.timed_mirrors import timed_mirrors, with_timed
@@ -188,10 +189,7 @@ def _levelled(
     found = glints(sources, sources.rays_each(positions, site.obstacles, in_sight=seen), spectra)
     dark = silent_sources(found, sources.reflection, sources.order)
     found = found.only(~dark[found.source])
-    reflection = fit_reflection(found, len(sources.planes))
-    assert sources.patches is not None
-    marks, ripple = fit_marks(found, reflection, sources.planes, sources.patches, paint)
-    return replace(sources, reflection=reflection, marks=marks, ripple=ripple), found
+    return fit_levels(sources, found, paint), found
 
 
 def with_images(

@@ -13,7 +13,6 @@ from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid
 from rf3dgs.propagation.config import TraceConfig
 from rf3dgs.propagation.sionna import Tracer
-from rf3dgs.propagation.sites.materials import VACUUM_PERMITTIVITY
 from rf3dgs.propagation.sites.scene import Scene, SceneObject, without_looks
 from rf3dgs.spectra.scan import spectrum_of
 from rf3dgs.spectra.spectrum import Spectrum

@@ -10,9 +10,7 @@ import math
 from typing import NamedTuple
 
 from rf3dgs.core.errors import InputError
-from rf3dgs.core.units import SPEED_OF_LIGHT
-
-VACUUM_PERMITTIVITY = 8.8541878128e-12  # [F/m]
+from rf3dgs.core.units import SPEED_OF_LIGHT, VACUUM_PERMITTIVITY
 
 
 class Material(NamedTuple):
