@@ -53,7 +53,7 @@ def learned() -> tuple[PointSources, Glints]:
 
 
 def test_levels_of_slabs_are_told_at_other_places(learned):
-    """Of two reflections too, which parabolas of unpolarised power miss by more than a decibel; three of four errors."""
+    """Of two reflections too, which parabolas of unpolarised power miss by over a decibel; three of four errors."""
     sources = fit_levels(*learned)
     assert sources.slabs is not None
     _, other = looked(measured(16, 5))

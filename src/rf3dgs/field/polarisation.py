@@ -37,7 +37,8 @@ class Slabs:
     @classmethod
     def of(cls, normals: Tensor, numbers: Tensor, frequency: float) -> "Slabs":
         """The slabs of planes with unit normals `[P, 3]`."""
-        return cls(*(each.detach().double().contiguous().numpy() for each in (normals, numbers)), frequency)
+        rows, values = (each.detach().double().contiguous().numpy() for each in (normals, numbers))
+        return cls(rows, values, frequency)
 
     @cached_property
     def held(self) -> Any | None:
@@ -92,8 +93,8 @@ def _across(way: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 def _coefficients(of: Slabs, plane: np.ndarray, cosine: np.ndarray) -> np.ndarray:
     """What slabs reflect `[n, 2]` of TE and TM, over the root of the mean of both powers."""
-    numbers = torch.from_numpy(of.numbers[plane])
-    pair = slab_coefficients(*numbers.unbind(-1), torch.from_numpy(cosine).clamp_min(GRAZING), of.frequency)
+    angles = torch.from_numpy(cosine).clamp_min(GRAZING)
+    pair = slab_coefficients(torch.from_numpy(of.numbers[plane]), angles, of.frequency)
     both = torch.stack(pair, -1).numpy()
     size = np.sqrt(0.5 * (np.abs(both) ** 2).sum(-1, keepdims=True))
     return np.where(size > 0.0, both / np.where(size > 0.0, size, 1.0), [-1.0, 1.0])

@@ -64,8 +64,8 @@ class PointSources:
             raise InputError(f"slabs must be [{count}, 3], a row a plane; got {list(self.slabs.shape)}")
         if self.slabs is not None and not bool(((self.slabs >= 0) & (self.slabs[:, :1] >= 1)).all()):
             raise InputError(
-                "slabs must have relative permittivities of 1 or more, and conductivities [S/m] and thicknesses [m] that "
-                f"are not negative; got {self.slabs.amin(0).tolist()} at least"
+                "slabs must have relative permittivities of 1 or more, and no negative conductivities [S/m] and "
+                f"thicknesses [m]; got {self.slabs.amin(0).tolist()} at least"
             )
         if self.tx.shape != (3,):
             raise InputError(f"tx must be three coordinates in metres; got {list(self.tx.shape)}")

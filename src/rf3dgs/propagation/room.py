@@ -106,10 +106,8 @@ def slab_reflection(slab: Slab, cosine: Tensor, frequency: float) -> tuple[Tenso
 
     See `slab_coefficients`.
     """
-    numbers = (
-        torch.tensor(each, dtype=torch.float64) for each in (slab.permittivity, slab.conductivity, slab.thickness)
-    )
-    return slab_coefficients(*numbers, cosine, frequency)
+    numbers = torch.tensor([slab.permittivity, slab.conductivity, slab.thickness], dtype=torch.float64)
+    return slab_coefficients(numbers, cosine, frequency)
 
 
 def _images(order: int) -> Tensor:

@@ -47,7 +47,7 @@ def fit_slabs(found: Glints, reflection: Tensor, frequency: float) -> tuple[Tens
     """Slabs `[P, 3]`, relative permittivity, conductivity [S/m] and thickness [m], and by how much they and the
     roughness of each differ from the laws `reflection` `[P, 3]`: a ripple `[P, RIPPLE]` [dB].
 
-    Planes of which no slab tells most single reflections keep their law, and polarisation as metal does; None if all do.
+    Planes of which no slab tells most single reflections keep their law, and polarisation as metal does; None for all.
     """
     single = found.only(found.alone & found.seen & (found.order == 1))
     law_db, plane = law_levels(single, reflection), single.plane[:, 0]
@@ -79,22 +79,24 @@ def _polarised(sources: PointSources, found: Glints) -> PointSources:
 
     One reflection tells levels alone; a surface that takes the same of both polarisations may have a slab's.
     """
-    assert sources.slabs is not None
+    slabs = sources.slabs
+    assert slabs is not None
     twice = found.only(found.alone & found.seen & (found.order == 2))
-    metal = sources.slabs.new_tensor(METAL)
-    for number in torch.nonzero((sources.slabs != metal).any(-1)).squeeze(-1).tolist():
+    metal = slabs.new_tensor(METAL)
+    for number in torch.nonzero((slabs != metal).any(-1)).squeeze(-1).tolist():
         own = twice.only((twice.plane == number).any(-1))
-        slabs = sources.slabs.index_put((torch.tensor([number]),), metal)
-        other = replace(sources, slabs=slabs)
-        with_slab, without = (_misfit(own.level_db - expected_db(own, one)) for one in (sources, other))
-        if float(without) < float(with_slab):
-            sources = other
-    return sources
+        others = slabs.index_put((torch.tensor([number]),), metal)
+        with_slab, without = (
+            float(_misfit(own.level_db - expected_db(own, replace(sources, slabs=each)))) for each in (slabs, others)
+        )
+        if without < with_slab:
+            slabs = others
+    return replace(sources, slabs=slabs)
 
 
 def slab_levels(slab: Tensor, cosine: Tensor, frequency: float) -> Tensor:
     """10 log10 of the mean power [dB] that slabs `[*batch, 3]` reflect of both polarisations; shapes broadcast."""
-    te, tm = slab_coefficients(*slab.unbind(-1), cosine.clamp_min(1e-3), frequency)
+    te, tm = slab_coefficients(slab, cosine.clamp_min(1e-3), frequency)
     return 10 * torch.log10((0.5 * (te.abs().square() + tm.abs().square())).clamp_min(10 ** (LEAST_DB / 10)))
 
 

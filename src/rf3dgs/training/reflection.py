@@ -35,9 +35,10 @@ class Glints:
 
     position, source `[n]`: which. plane `[n, 3]`: the mirrors from the transmitter on, -1 beyond the last. point
     `[n, 3, 3]`: where the reflections are [m]. cosine `[n, 3]` of incidence. departure `[n, 3]`: unit vectors from the
-    transmitter. level_db `[n]`: 10 log10 of what stands out over Friis and the sources' level. limit_db `[n]`: what in the same measure a peak must exceed to be seen: the
-    level of the surroundings, or of another wave that arrives there. seen `[n]`: the peak stands 3 dB over its
-    surroundings, and at the time of its way where the spectra have delays. alone `[n]`: no other ray arrives beside it.
+    transmitter. level_db `[n]`: 10 log10 of what stands out over Friis and the sources' level. limit_db `[n]`: what in
+    the same measure a peak must exceed to be seen: the level of the surroundings, or of another wave that arrives
+    there. seen `[n]`: the peak stands 3 dB over its surroundings, and at the time of its way where the spectra have
+    delays. alone `[n]`: no other ray arrives beside it.
     """
 
     position: Tensor

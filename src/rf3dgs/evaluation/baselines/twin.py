@@ -11,6 +11,7 @@ from rf3dgs.channel.paths import Paths
 from rf3dgs.core.errors import InputError
 from rf3dgs.core.frames import Pose
 from rf3dgs.core.grids import DirectionGrid
+from rf3dgs.core.units import VACUUM_PERMITTIVITY
 from rf3dgs.propagation.config import TraceConfig
 from rf3dgs.propagation.sionna import Tracer
 from rf3dgs.propagation.sites.scene import Scene, SceneObject, without_looks
