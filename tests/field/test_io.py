@@ -59,6 +59,7 @@ def test_mirrors_come_back_from_disk_and_give_the_same_rays(field, tmp_path):
         open_above=0.2,
         marks=marks,
         ripple=torch.linspace(-3, 3, 2 * RIPPLE).reshape(2, RIPPLE),
+        slabs=torch.tensor([[1.5, 0.1, 0.02], [6.8, 0.25, 0.03]]),
     )
     plane_of = torch.where(field.surface.means[:, 2].abs() < 0.01, 0, -1)
     mirrors = replace(field, sources=sources, plane_of=plane_of)
@@ -66,6 +67,7 @@ def test_mirrors_come_back_from_disk_and_give_the_same_rays(field, tmp_path):
     loaded = load_field(tmp_path / "mirrors.field")
     assert torch.equal(loaded.plane_of, plane_of)
     assert loaded.sources.patches.cell == 0.2
+    assert torch.equal(loaded.sources.slabs, sources.slabs)
     before, after = mirrors.paths(HERE, parts="sources"), loaded.paths(HERE, parts="sources")
     assert int(before.valid.sum()) >= 3
     torch.testing.assert_close(before.delay, after.delay)

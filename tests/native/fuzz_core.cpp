@@ -30,6 +30,7 @@
 #include "splats/morton.hpp"
 #include "splats/rasterize.hpp"
 #include "splats/trainer.hpp"
+#include "ways/polarisation.hpp"
 #include "ways/reflections.hpp"
 #include "ways/ways.hpp"
 
@@ -586,6 +587,21 @@ void reflections() {
   for (const double sum_db : once) require(!(sum_db > 0.0), "no reflection gains power");
 }
 
+void polarisation() {
+  const int64_t planes = one_of<int64_t>({1, 2, 6});
+  const size_t count = one_of<size_t>({0, 1, 63, 65, 300});
+  const auto normals = drawn(3 * planes, 1.0), slabs = drawn(3 * planes, 4.0);
+  const auto cosine = drawn(kMostReflections * count, 0.5), departure = drawn(3 * count, 1.0);
+  std::vector<int64_t> met(kMostReflections * count);
+  for (int64_t& plane : met) plane = static_cast<int64_t>(generator() % (planes + 1)) - 1;
+  const SlabTable table{normals.data(), slabs.data()};
+  std::vector<double> once(count), again(count);
+  keep(table, met.data(), cosine.data(), departure.data(), count, 1, once.data());
+  keep(table, met.data(), cosine.data(), departure.data(), count, 3, again.data());
+  require(count == 0 || std::memcmp(once.data(), again.data(), count * sizeof(double)) == 0,
+          "polarisation does not depend on the number of threads");
+}
+
 }  // namespace
 
 int main(int count, char** words) {
@@ -602,6 +618,7 @@ int main(int count, char** words) {
     segments();
     ways();
     reflections();
+    polarisation();
     if (round_number % 10 == 0) pool();
     if (round_number % 25 == 5 && forks) fork_and_draw();
   }
