@@ -7,6 +7,8 @@ from rf3dgs.core import manifest
 from rf3dgs.core.errors import DataError, InputError
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from rf3dgs.data.dataset import Dataset
     from rf3dgs.field.radio_field import RadioField
     from rf3dgs.propagation.sites.scene import Scene
@@ -94,7 +96,17 @@ def _field_facts(path: str | Path) -> dict[str, str]:
         "encoding": field.surface.encoding,
         "trained between": f"({low}) and ({high}) m",
     }
+    if field.sources is not None and field.sources.slabs is not None:
+        facts["planes that are slabs"] = _slabs_of(field.sources.slabs)
     return facts | {name: value for name, value in meta.items() if name not in facts}
+
+
+def _slabs_of(slabs: "Tensor") -> str:
+    """The planes that were found to be slabs, by relative permittivity and thickness."""
+    from rf3dgs.field.polarisation import METAL
+
+    known = slabs[slabs[:, 1] < METAL[1]]
+    return ", ".join(f"{1e3 * thick:.0f} mm of permittivity {eta:.1f}" for eta, _, thick in known.tolist()) or "none"
 
 
 def _dataset_facts(path: Path) -> dict[str, str]:
