@@ -14,6 +14,7 @@ from rf3dgs.field.images import sequences
 from rf3dgs.field.polarisation import METAL, Slabs, kept_db, kept_reference
 from rf3dgs.field.reflections import RIPPLE
 from rf3dgs.field.sources import PointSources
+from rf3dgs.field.ways import ways_over
 from rf3dgs.geometry import Planes
 from rf3dgs.propagation.room import Slab, shoebox
 from rf3dgs.splats.obstacles import Obstacles
@@ -22,8 +23,9 @@ from rf3dgs.training.levels import slab_levels
 SIZE = torch.tensor([6.0, 5.0, 3.0])
 TX = torch.tensor([1.0, 1.2, 2.4])
 FREQUENCY = 60e9
-WALLS = (Slab(6.3, 0.9, 0.012), Slab(2.5, 1.2, 0.1), Slab(1.5, 0.1, 0.02), Slab(3.7, 1.1, 0.03), Slab(6.8, 0.25, 0.01))
-WALLS = (*WALLS, Slab(5.0, 0.0, 0.004))
+OF_X = (Slab(6.3, 0.9, 0.012), Slab(2.5, 1.2, 0.1))
+OF_Y = (Slab(1.5, 0.1, 0.02), Slab(3.7, 1.1, 0.03))
+WALLS = (*OF_X, *OF_Y, Slab(6.8, 0.25, 0.01), Slab(5.0, 0.0, 0.004))
 FREE = Obstacles(torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0))
 
 
@@ -48,8 +50,6 @@ def receivers() -> torch.Tensor:
 def ways(receivers) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Planes, cosines and departures of all ways in the room."""
     sources = room_of_slabs()
-    from rf3dgs.field.ways import ways_over
-
     found = ways_over(sources.plan, receivers.double().numpy())
     return sources.plan.sequence[found.source], found.cosine, found.departure
 
