@@ -38,9 +38,9 @@ def fit_levels(sources: PointSources, found: Glints, paint: Paint | None = None)
     if slabs is not None:
         sources = _polarised(sources, found)
     marks, more = fit_deviations(found, sources, paint)
-    if ripple is not None and more is not None:
-        more = ripple + more
-    return replace(sources, marks=marks, ripple=ripple if more is None else more)
+    if sources.ripple is not None:
+        more = sources.ripple if more is None else sources.ripple + more
+    return replace(sources, marks=marks, ripple=more)
 
 
 def fit_slabs(found: Glints, reflection: Tensor, frequency: float) -> tuple[Tensor, Tensor] | tuple[None, None]:
@@ -77,7 +77,8 @@ def fit_slabs(found: Glints, reflection: Tensor, frequency: float) -> tuple[Tens
 def _polarised(sources: PointSources, found: Glints) -> PointSources:
     """The sources, whose planes are slabs, without those as which ways of two reflections do not see them.
 
-    One reflection tells levels alone; a surface that takes the same of both polarisations may have a slab's.
+    One reflection tells levels alone; a surface that takes the same of both polarisations may have a slab's. Where none
+    is seen as one, levels that look like slabs' are taken for chance, and planes keep their laws.
     """
     slabs = sources.slabs
     assert slabs is not None
@@ -91,6 +92,8 @@ def _polarised(sources: PointSources, found: Glints) -> PointSources:
         )
         if without < with_slab:
             slabs = others
+    if bool((slabs == metal).all()):
+        return replace(sources, slabs=None, ripple=None)
     return replace(sources, slabs=slabs)
 
 
