@@ -21,3 +21,10 @@ def native_core() -> ModuleType | None:
 def native_failure() -> str:
     """Why the compiled module cannot be loaded; empty when it can."""
     return _load()[1]
+
+
+class Held:
+    """What the native core holds too, as its property `held`, which copies and pickles make anew."""
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in self.__dict__.items() if name != "held"}

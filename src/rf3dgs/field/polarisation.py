@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rf3dgs.core.native import native_core
+from rf3dgs.core.native import Held, native_core
 from rf3dgs.core.threads import thread_count
 from rf3dgs.core.units import VACUUM_PERMITTIVITY, wavelength
 from rf3dgs.propagation.fresnel import slab_coefficients
@@ -26,7 +26,7 @@ FEW = 256  # ways that are answered sooner than other threads wake
 
 
 @dataclass(frozen=True, eq=False)
-class Slabs:
+class Slabs(Held):
     """What P planes are made of: normals `[P, 3]`; numbers `[P, 3]`, relative permittivity, conductivity [S/m] and
     thickness [m]; frequency [Hz]."""
 
@@ -48,9 +48,6 @@ class Slabs:
             return None
         loss = 1 / (2 * math.pi * self.frequency * VACUUM_PERMITTIVITY)
         return core.Slabs(self.normals, self.numbers * [1.0, loss, 2 * math.pi / wavelength(self.frequency)])
-
-    def __getstate__(self) -> dict[str, object]:
-        return {name: value for name, value in self.__dict__.items() if name != "held"}
 
 
 def kept_db(of: Slabs, planes: np.ndarray, cosine: np.ndarray, departure: np.ndarray) -> np.ndarray:

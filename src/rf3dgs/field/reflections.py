@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rf3dgs.core.native import native_core
+from rf3dgs.core.native import Held, native_core
 from rf3dgs.core.threads import thread_count
 
 RIPPLE = 81  # cosines from 0 to 1 at which a ripple is kept
@@ -35,7 +35,7 @@ class Marks:
 
 
 @dataclass(frozen=True, eq=False)
-class Reflections:
+class Reflections(Held):
     """What reflections at P planes leave, made once.
 
     laws `[P, 3]`: a, b and c of each plane. ripple `[P, RIPPLE]` [dB]. points `[M, 3]` [m] and level_db `[M]` of marks,
@@ -72,9 +72,6 @@ class Reflections:
         if core is None:
             return None
         return core.Reflections(self.laws, self.ripple, self.points, self.along, self.level_db, self.start, self.width)
-
-    def __getstate__(self) -> dict[str, object]:
-        return {name: value for name, value in self.__dict__.items() if name != "held"}
 
 
 def reflected_db(of: Reflections, planes: np.ndarray, cosine: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rf3dgs.core.native import native_core
+from rf3dgs.core.native import Held, native_core
 from rf3dgs.core.threads import thread_count
 from rf3dgs.field.images import HIGHEST_ORDER
 from rf3dgs.geometry import Patches
@@ -89,7 +89,7 @@ class Reach:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(Held):
     """What folding asks of K sources over P planes, made once.
 
     chain `[K, 4, 3]`: the transmitter and its images [m]; sequence `[K, 3]` and order `[K]` as in `PointSources`;
@@ -128,9 +128,6 @@ class Plan:
         if reach is not None:
             where = (reach.axes, reach.low, reach.last, reach.wide, reach.start, reach.cells)
         return core.WayPlan(*(None if each is None else np.ascontiguousarray(each) for each in (*own, *where)))
-
-    def __getstate__(self) -> dict[str, object]:
-        return {name: value for name, value in self.__dict__.items() if name != "held"}
 
 
 def ways_over(plan: Plan, receivers: np.ndarray, asked: np.ndarray | None = None) -> Ways:
