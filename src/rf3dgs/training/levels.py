@@ -2,7 +2,7 @@
 docs/theory/radiance.md.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from rf3dgs.field.polarisation import METAL
 from rf3dgs.field.reflections import RIPPLE
 from rf3dgs.field.sources import PointSources
 from rf3dgs.propagation.fresnel import slab_coefficients
+from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.training.marks import Paint, fit_deviations
 from rf3dgs.training.reflection import Glints, expected_db, fit_reflection, law_levels
 
@@ -21,6 +22,7 @@ LEAST_PEAKS, MOST_PEAKS = 8, 120
 PERMITTIVITIES = torch.logspace(0.115, 0.955, 16, dtype=torch.float64)  # 1.3 to 9
 LOSSES = torch.tensor([0.0, 0.01, 0.03, 0.1, 0.3, 1.0], dtype=torch.float64)  # of the relative permittivity
 THICKNESSES = torch.arange(0.4, 8.0, 0.03, dtype=torch.float64)  # of wavelengths
+SHELF_COSINES = 128  # of incidence, between which a shelf's levels are interpolated
 LARGEST = (12.0, 3.0, 9.0)  # of these three
 SMALL_LOSS = 3e-3
 ROUGH_DB, BRIGHT_DB = -14.0, 0.5  # what a surface may have beside a smooth slab: rough ones scatter
@@ -28,6 +30,11 @@ LIKE_DB, OTHER = 1.5, 2.5  # an error counts as its square up to the first, and 
 TRIED = 4
 HIT_DB, HIT_SHARE, HIT_RMS_DB = 1.0, 0.75, 0.5  # a plane is a slab if so many peaks are that near
 LEAST_DB = -60.0
+
+
+def told_by(spectra: Spectrum) -> int:
+    """How many reflections at most the peaks have that tell levels: two where delays say whose peak it is, else one."""
+    return 1 if spectra.delay is None else 2
 
 
 def fit_levels(sources: PointSources, found: Glints, paint: Paint | None = None) -> PointSources:
@@ -54,6 +61,7 @@ def fit_slabs(found: Glints, reflection: Tensor, frequency: float) -> tuple[Tens
     metal = torch.tensor(METAL).repeat(len(reflection), 1)
     slabs, ripple = metal.clone(), torch.zeros(len(reflection), RIPPLE)
     angles = torch.linspace(0, 1, RIPPLE, dtype=torch.float64)
+    shelf = _Shelf.at(frequency)
 
     def fitted(number: int) -> None:
         own = torch.nonzero(plane == number).squeeze(-1)
@@ -61,7 +69,7 @@ def fit_slabs(found: Glints, reflection: Tensor, frequency: float) -> tuple[Tens
             return
         own = own[torch.linspace(0, len(own) - 1, min(len(own), MOST_PEAKS)).long()]
         cosine, level_db = single.cosine[own, 0], single.level_db[own]
-        slab, rough_db = _slab_of(cosine, level_db, frequency)
+        slab, rough_db = _slab_of(cosine, level_db, shelf)
         error_db = level_db - slab_levels(slab, cosine, frequency) - rough_db
         hit = error_db.abs() < HIT_DB
         near = float(hit.double().mean()) >= HIT_SHARE and float(error_db[hit].square().mean().sqrt()) < HIT_RMS_DB
@@ -103,26 +111,53 @@ def slab_levels(slab: Tensor, cosine: Tensor, frequency: float) -> Tensor:
     return 10 * torch.log10((0.5 * (te.abs().square() + tm.abs().square())).clamp_min(10 ** (LEAST_DB / 10)))
 
 
-def _slab_of(cosine: Tensor, level_db: Tensor, frequency: float) -> tuple[Tensor, float]:
+@dataclass(frozen=True, eq=False)
+class _Shelf:
+    """Slabs that are tried first at a `frequency` [Hz]: `[n, 3]` in units `unit` `[3]` of permittivity, conductivity
+    [S/m] and thickness [m], and their levels [dB] `[n, SHELF_COSINES]`."""
+
+    frequency: float
+    unit: Tensor
+    slabs: Tensor
+    levels: Tensor
+
+    @classmethod
+    def at(cls, frequency: float) -> "_Shelf":
+        """All of `PERMITTIVITIES`, `LOSSES` and `THICKNESSES`."""
+        unit = torch.tensor(
+            [1.0, 2 * torch.pi * frequency * VACUUM_PERMITTIVITY, wavelength(frequency)], dtype=torch.float64
+        )
+        slabs = torch.cartesian_prod(PERMITTIVITIES, LOSSES, THICKNESSES)
+        angles = torch.linspace(0, 1, SHELF_COSINES, dtype=torch.float64)
+        parts = [part * unit for part in slabs.split(len(LOSSES) * len(THICKNESSES))]
+        levels = on_threads(lambda part: slab_levels(part[:, None], angles, frequency).float(), parts)
+        return cls(frequency, unit, slabs, torch.cat(levels))
+
+    def seen(self, cosine: Tensor) -> Tensor:
+        """The levels [dB] `[n, m]` at cosines of incidence `[m]`."""
+        place = (cosine * (SHELF_COSINES - 1)).float()
+        below = place.long().clamp(0, SHELF_COSINES - 2)
+        return torch.lerp(self.levels[:, below], self.levels[:, below + 1], place - below)
+
+
+def _slab_of(cosine: Tensor, level_db: Tensor, shelf: _Shelf) -> tuple[Tensor, float]:
     """The slab `[3]` and the level [dB] beside it that tell most levels `[n]` at cosines of incidence `[n]`."""
     from scipy.optimize import least_squares
 
-    unit = _units(frequency)
-    shelf = torch.cartesian_prod(PERMITTIVITIES, LOSSES, THICKNESSES) * unit
-    left_db = level_db - slab_levels(shelf[:, None], cosine, frequency)
+    left_db = level_db.float() - shelf.seen(cosine)
     rough_db = left_db.median(-1).values.clamp(ROUGH_DB, BRIGHT_DB)
     best = _misfit(left_db - rough_db[:, None]).argsort(stable=True)[:TRIED]
     low = (np.log(1.05), np.log(SMALL_LOSS), 0.2, ROUGH_DB - 1e-6)
     high = (*np.log(LARGEST[:2]), LARGEST[2], BRIGHT_DB + 1e-6)
 
     def slab(x: np.ndarray) -> Tensor:
-        return torch.tensor([np.exp(x[0]), np.exp(x[1]) - SMALL_LOSS, x[2]], dtype=torch.float64) * unit
+        return torch.tensor([np.exp(x[0]), np.exp(x[1]) - SMALL_LOSS, x[2]], dtype=torch.float64) * shelf.unit
 
     def errors(x: np.ndarray) -> np.ndarray:
-        return (level_db - slab_levels(slab(x), cosine, frequency) - x[3]).numpy()
+        return (level_db - slab_levels(slab(x), cosine, shelf.frequency) - x[3]).numpy()
 
     found = []
-    for start, level in zip((shelf[best] / unit).tolist(), rough_db[best].tolist(), strict=True):
+    for start, level in zip(shelf.slabs[best].tolist(), rough_db[best].tolist(), strict=True):
         first = np.clip((np.log(start[0]), np.log(start[1] + SMALL_LOSS), start[2], level), low, high)
         x = least_squares(errors, first, loss="cauchy", bounds=(low, high), max_nfev=60).x
         found.append((float(_misfit(torch.from_numpy(errors(x)))), x))
@@ -134,10 +169,3 @@ def _misfit(error_db: Tensor) -> Tensor:
     """Sum over the last axis of errors `[..., n]`, of which large ones count alike."""
     size = error_db.abs()
     return torch.where(size < LIKE_DB, size.square() / (2 * LIKE_DB), size - LIKE_DB / 2).clamp_max(OTHER).sum(-1)
-
-
-def _units(frequency: float) -> Tensor:
-    """Conductivity [S/m] of a loss of 1, and a wavelength [m], behind a 1."""
-    return torch.tensor(
-        [1.0, 2 * torch.pi * frequency * VACUUM_PERMITTIVITY, wavelength(frequency)], dtype=torch.float64
-    )

@@ -14,7 +14,7 @@ from rf3dgs.field.sources import PointSources
 from rf3dgs.field.uncertainty import NUMBERS, SHARES, Uncertainty, numbers_of
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.training.calibration import minimum
-from rf3dgs.training.levels import fit_levels
+from rf3dgs.training.levels import fit_levels, told_by
 from rf3dgs.training.reflection import Glints, glints
 
 STRONGEST = 8  # paths of a position
@@ -41,8 +41,8 @@ def measured_ways(field: RadioField, spectra: Spectrum) -> Glints | None:
     sources = field.sources
     if sources is None or not len(sources.planes):
         return None
-    once = replace(sources, sequence=sources.sequence[sources.order <= 1])
-    return glints(once, once.rays_each(spectra.pose.position, field.obstacles), spectra)
+    telling = replace(sources, sequence=sources.sequence[sources.order <= told_by(spectra)])
+    return glints(telling, telling.rays_each(spectra.pose.position, field.obstacles), spectra)
 
 
 def sources_without(sources: PointSources | None, measured: Glints | None, places: list[int]) -> PointSources | None:
@@ -57,7 +57,8 @@ def known_places(measured: Glints | None, without: list[int]) -> PathDoubt:
     """Where the positions but for some measured what planes reflect; the laws are not known yet."""
     points, plane = torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)
     if measured is not None:
-        some = measured.only(measured.alone & ~torch.isin(measured.position, torch.tensor(without, dtype=torch.long)))
+        left = ~torch.isin(measured.position, torch.tensor(without, dtype=torch.long))
+        some = measured.only(left & measured.alone & (measured.order == 1))
         points, plane = some.point[:, 0], some.plane[:, 0]
     return PathDoubt(points, plane, torch.tensor([0.0, 1.0]), torch.tensor(USUAL), torch.tensor(SHARES))
 
