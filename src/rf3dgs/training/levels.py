@@ -14,10 +14,10 @@ from rf3dgs.field.polarisation import METAL
 from rf3dgs.field.reflections import RIPPLE
 from rf3dgs.field.sources import PointSources
 from rf3dgs.propagation.fresnel import slab_coefficients
-from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.training.marks import Paint, fit_deviations
 from rf3dgs.training.reflection import Glints, expected_db, fit_reflection, law_levels
 
+TOLD_BY = 2  # reflections at most of the peaks that tell levels
 LEAST_PEAKS, MOST_PEAKS = 8, 120
 PERMITTIVITIES = torch.logspace(0.115, 0.955, 16, dtype=torch.float64)  # 1.3 to 9
 LOSSES = torch.tensor([0.0, 0.01, 0.03, 0.1, 0.3, 1.0], dtype=torch.float64)  # of the relative permittivity
@@ -30,11 +30,6 @@ LIKE_DB, OTHER = 1.5, 2.5  # an error counts as its square up to the first, and 
 TRIED = 4
 HIT_DB, HIT_SHARE, HIT_RMS_DB = 1.0, 0.75, 0.5  # a plane is a slab if so many peaks are that near
 LEAST_DB = -60.0
-
-
-def told_by(spectra: Spectrum) -> int:
-    """How many reflections at most the peaks have that tell levels: two where delays say whose peak it is, else one."""
-    return 1 if spectra.delay is None else 2
 
 
 def fit_levels(sources: PointSources, found: Glints, paint: Paint | None = None) -> PointSources:

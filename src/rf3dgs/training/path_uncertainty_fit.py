@@ -14,7 +14,7 @@ from rf3dgs.field.sources import PointSources
 from rf3dgs.field.uncertainty import NUMBERS, SHARES, Uncertainty, numbers_of
 from rf3dgs.spectra.spectrum import Spectrum
 from rf3dgs.training.calibration import minimum
-from rf3dgs.training.levels import fit_levels, told_by
+from rf3dgs.training.levels import TOLD_BY, fit_levels
 from rf3dgs.training.reflection import Glints, glints
 
 STRONGEST = 8  # paths of a position
@@ -41,7 +41,7 @@ def measured_ways(field: RadioField, spectra: Spectrum) -> Glints | None:
     sources = field.sources
     if sources is None or not len(sources.planes):
         return None
-    telling = replace(sources, sequence=sources.sequence[sources.order <= told_by(spectra)])
+    telling = replace(sources, sequence=sources.sequence[sources.order <= TOLD_BY])
     return glints(telling, telling.rays_each(spectra.pose.position, field.obstacles), spectra)
 
 

@@ -17,7 +17,7 @@ from rf3dgs.splats.gaussians import Gaussians
 from rf3dgs.splats.obstacles import Obstacles
 from rf3dgs.training.config import SourceConfig
 from rf3dgs.training.consolidation import consolidated, oblique_planes, squared, walls_whole, with_skins
-from rf3dgs.training.levels import fit_levels, told_by
+from rf3dgs.training.levels import TOLD_BY, fit_levels
 from rf3dgs.training.line_of_sight import fit_line_of_sight, fit_opening
 from rf3dgs.training.marks import Paint
 from rf3dgs.training.reflection import DIELECTRIC, Glints, fit_reflection, glints, silent_planes, silent_sources
@@ -86,7 +86,7 @@ def fit_sources(
     site = _opened(site, spectra, seen)
     paint = None if geometry is None else Paint.of(geometry, site.surfaces.plane_of)
     sources, found = _levelled(site, spectra, seen, probes, paint, config)
-    if config.order > told_by(spectra):
+    if config.order > TOLD_BY:
         sources = with_images(sources, probes, config)
     sources = _strongest(sources, probes, site.obstacles, spectra, config)
     looked = glints(sources, sources.rays_each(positions, site.obstacles, in_sight=seen), spectra)
@@ -184,7 +184,7 @@ def _levelled(
     sources = replace(sources, reflection=fit_reflection(found, len(sources.planes)))
     assert sources.patches is not None
     silent = silent_planes(found, len(sources.planes), oblique_planes(sources.planes, sources.patches))
-    sources = with_images(sources, probes, replace(config, order=min(config.order, told_by(spectra))), silent=silent)
+    sources = with_images(sources, probes, replace(config, order=min(config.order, TOLD_BY)), silent=silent)
     found = glints(sources, sources.rays_each(positions, site.obstacles, in_sight=seen), spectra)
     dark = silent_sources(found, sources.reflection, sources.order)
     found = found.only(~dark[found.source])
