@@ -438,6 +438,29 @@ def test_a_level_that_comes_and_goes_with_the_angle_is_a_ripple():
     assert marks is None or float(marks.level_db.abs().mean()) < 1.0
 
 
+def test_two_reflections_tell_deviations_only_where_delays_do():
+    """On a floor that is 12 dB brighter where only ways over a wall come from: marks rise there if peaks are timed."""
+    planes = Planes(torch.tensor([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]), torch.zeros(2))
+    generator = torch.Generator().manual_seed(8)
+    floor = torch.rand(4000, 3, generator=generator) * torch.tensor([9.0, 0.0, 3.0])
+    wall = floor[:, [1, 0, 2]]
+    places = torch.rand(60, 3, generator=generator) * torch.tensor([9.0, 0.0, 3.0])
+    bright = places[:, 0] > 5.0
+    twice = bright[:, None] & torch.tensor([False, True, False])
+    found = peaks_at(places, torch.where(bright, 2.0, -10.0))
+    found = replace(found, plane=torch.where(twice, 1, found.plane))
+    rows, laws = torch.tensor([[-1, -1, -1], [0, -1, -1]]), torch.tensor([[-10.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    plain = PointSources(TX, FREQUENCY, planes, Patches.of(planes, [floor, wall]), rows, laws)
+
+    def told_db(found: Glints) -> float:
+        marks, ripple = fit_deviations(found, plain)
+        asked = peaks_at(torch.tensor([[7.0, 0.0, 1.5]]), torch.zeros(1))
+        return float(expected_db(asked, replace(plain, marks=marks, ripple=ripple))) + 10.0
+
+    assert told_db(found) > 8.0
+    assert abs(told_db(replace(found, timed=torch.zeros_like(found.timed)))) < 1.0
+
+
 def peaks_at(places: torch.Tensor, level_db: torch.Tensor) -> Glints:
     """Peaks of one reflection at places `[n, 3]` of one plane."""
     count = len(places)
@@ -447,7 +470,7 @@ def peaks_at(places: torch.Tensor, level_db: torch.Tensor) -> Glints:
     levels = (level_db.double(), torch.full((count,), -60.0).double())
     cosine = torch.ones(count, 3, dtype=torch.float64)
     point, departure = places[:, None].expand(-1, 3, 3), torch.tensor([0.0, -1.0, 0.0]).expand(count, 3)
-    return Glints(torch.arange(count), zeros, plane, point, cosine, departure, *levels, yes, yes)
+    return Glints(torch.arange(count), zeros, plane, point, cosine, departure, *levels, yes, yes, yes)
 
 
 def one_plane(planes: Planes, spots: torch.Tensor) -> PointSources:

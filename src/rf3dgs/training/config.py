@@ -36,7 +36,7 @@ class RadioConfig:
     shadow and every way is open."""
     joint: int | None = None
     """The mirror model alone: steps of joint refinement of the surface after the closed form, each on two training
-    positions; None is 140, 0 leaves the closed form as it is."""
+    positions; None is 120, 0 leaves the closed form as it is."""
     uncertainty: bool = False
     """The mirror model alone: learn how far its levels may be off, by leaving training positions out in turn. It takes
     about three times as long as the rest."""

@@ -23,7 +23,7 @@ from rf3dgs.training.lit_fit import BAND, LAW_HIGH, LAW_LOW, LAW_SPREAD, OFF_DB,
 from rf3dgs.training.lit_views import SOFT_NS, SOFT_TURN
 
 AT_ONCE = 2
-RATE = 0.06  # Adam's first step, in units of `SCALES`; it falls to zero
+RATE = 0.07  # Adam's first step, in units of `SCALES`; it falls to zero
 CSI_UNIT = torch.tensor([SOFT_NS, SOFT_TURN, SOFT_TURN, SOFT_TURN])
 SCALES = {
     "laws": LAW_SPREAD,
@@ -95,7 +95,7 @@ def refine_jointly(
     start = {name: getattr(surface, name) for name in ("laws", *RESIDUAL)}
     still = (() if residual else RESIDUAL) + (() if views[0].has_csi else CSI)
     moved = {name: torch.zeros_like(x).requires_grad_() for name, x in start.items() if name not in still}
-    adam = torch.optim.Adam(list(moved.values()), lr=RATE)
+    adam = torch.optim.Adam(list(moved.values()), lr=RATE, fused=True)
     generator = torch.Generator().manual_seed(seed)
     rounds = 1 + steps * AT_ONCE // len(views)
     order = torch.cat([torch.randperm(len(views), generator=generator) for _ in range(rounds)])

@@ -3,6 +3,7 @@ docs/theory/radiance.md.
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -56,12 +57,13 @@ def fit_slabs(found: Glints, reflection: Tensor, frequency: float) -> tuple[Tens
     metal = torch.tensor(METAL).repeat(len(reflection), 1)
     slabs, ripple = metal.clone(), torch.zeros(len(reflection), RIPPLE)
     angles = torch.linspace(0, 1, RIPPLE, dtype=torch.float64)
+    enough = torch.nonzero(torch.bincount(plane, minlength=1) >= LEAST_PEAKS).squeeze(-1).tolist()
+    if not enough:
+        return None, None
     shelf = _Shelf.at(frequency)
 
     def fitted(number: int) -> None:
         own = torch.nonzero(plane == number).squeeze(-1)
-        if len(own) < LEAST_PEAKS:
-            return
         own = own[torch.linspace(0, len(own) - 1, min(len(own), MOST_PEAKS)).long()]
         cosine, level_db = single.cosine[own, 0], single.level_db[own]
         slab, rough_db = _slab_of(cosine, level_db, shelf)
@@ -73,7 +75,7 @@ def fit_slabs(found: Glints, reflection: Tensor, frequency: float) -> tuple[Tens
             whole = (slab_levels(slab, angles, frequency) + rough_db).clamp_max(0.0)
             slabs[number], ripple[number] = slab.float(), (whole - (a + angles * (b + angles * c))).float()
 
-    on_threads(fitted, plane.unique().tolist())
+    on_threads(fitted, enough)
     return (slabs, ripple) if bool((slabs != metal).any()) else (None, None)
 
 
@@ -117,6 +119,7 @@ class _Shelf:
     levels: Tensor
 
     @classmethod
+    @lru_cache(maxsize=1)
     def at(cls, frequency: float) -> "_Shelf":
         """All of `PERMITTIVITIES`, `LOSSES` and `THICKNESSES`."""
         unit = torch.tensor(

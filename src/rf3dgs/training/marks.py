@@ -22,6 +22,7 @@ from rf3dgs.training.reflection import Glints, expected_db
 PLACES = ((0.3, 0.0), (0.8, 0.0), (2.0, 0.06))  # widths [m] and differences of looks that are tried; 0: any
 COSINES = (0.03, 0.06)  # of incidence: widths that are tried
 BRUSH = 0.25  # m over which colours are averaged
+AT_ONCE = 128  # places whose looks are asked together
 DIM = 0.15  # red, green and blue together: darker colours are the greyer, the darker they are
 BRIGHTNESS = 0.12  # what a difference of brightness counts beside one of hue, for how bright a wall is depends on lamps
 LATTICE = 0.3  # m between marks
@@ -62,14 +63,19 @@ class Paint:
         """Looks `[n, 4]` around points `[n, 3]` [m] of planes `[n]`: hue, the shares of red, green and blue, and
         brightness times `BRIGHTNESS`; grey where nothing is painted."""
         result = torch.full((len(points), 3), 0.5)
+        parts = []
+        for number in plane.unique().tolist():
+            own = self.plane == number
+            known = self.means[own], self.colours[own], self.weight[own]
+            parts += [(here, *known) for here in torch.nonzero(plane == number).squeeze(-1).split(AT_ONCE)]
 
-        def painted(number: int) -> None:
-            here, own = torch.nonzero(plane == number).squeeze(-1), self.plane == number
-            near = torch.exp(-0.5 * torch.cdist(points[here], self.means[own]) ** 2 / BRUSH**2) * self.weight[own]
+        def painted(part: tuple[Tensor, Tensor, Tensor, Tensor]) -> None:
+            here, means, colours, weight = part
+            near = torch.cdist(points[here], means).square_().mul_(-0.5 / BRUSH**2).exp_().mul_(weight)
             whole = near.sum(-1, keepdim=True)
-            result[here] = torch.where(whole > 1e-9, near @ self.colours[own] / whole.clamp_min(1e-12), 0.5)
+            result[here] = torch.where(whole > 1e-9, near @ colours / whole.clamp_min(1e-12), 0.5)
 
-        on_threads(painted, plane.unique().tolist())
+        on_threads(painted, parts)
         total = result.sum(-1, keepdim=True)
         return torch.cat((result / total.clamp_min(DIM), BRIGHTNESS / 3 * total), -1)
 
@@ -105,11 +111,13 @@ def fit_deviations(
 
     A plane deviates if its peaks are told `WORTH_DB` better by the other peaks than by none; those of two reflections
     count half for each plane. How near, and of how like looks in `paint`, places are alike, and how near angles, is for
-    each plane what tells its peaks best. Deep losses that hardly stand over their surroundings tell nothing.
+    each plane what tells its peaks best. Deep losses that hardly stand over their surroundings tell nothing, nor do
+    peaks of two reflections without a delay that says whose they are.
     """
     miss = found.level_db - expected_db(found, sources)
     doubtful = (miss < -DOUBTFUL_DB) & (found.level_db < found.limit_db + DOUBTFUL_DB)
-    used = torch.nonzero(found.alone & found.seen & ~doubtful).squeeze(-1)
+    sure = found.timed | (found.order == 1)
+    used = torch.nonzero(found.alone & found.seen & sure & ~doubtful).squeeze(-1)
     used = used[found.order[used].argsort(stable=True)[:MOST_PEAKS]]
     found, miss = found.only(used), miss[used].clamp(-MOST_DB, MOST_DB)
     planes = len(sources.planes)

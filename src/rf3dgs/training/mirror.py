@@ -29,7 +29,7 @@ from rf3dgs.training.source_fit import fit_sources
 
 CELL = 4  # cells of the patches: 0.4 m unless Gaussians are large
 MIRROR_ORDER = 3  # unless the configuration says otherwise
-JOINT = 140  # steps, likewise
+JOINT = 120  # steps, likewise
 DEEPEST_DB = 90.0  # under the window's ceiling; what is darker is the tail of a beam, or directions that no ray reached
 STAGES = ("surfaces", "point sources", "observations", "laws", "residual", "joint refinement")
 

@@ -38,7 +38,7 @@ class Glints:
     transmitter. level_db `[n]`: 10 log10 of what stands out over Friis and the sources' level. limit_db `[n]`: what in
     the same measure a peak must exceed to be seen: the level of the surroundings, or of another wave that arrives
     there. seen `[n]`: the peak stands 3 dB over its surroundings, and at the time of its way where the spectra have
-    delays. alone `[n]`: no other ray arrives beside it.
+    delays. alone `[n]`: no other ray arrives beside it. timed `[n]`: there are delays.
     """
 
     position: Tensor
@@ -51,6 +51,7 @@ class Glints:
     limit_db: Tensor
     seen: Tensor
     alone: Tensor
+    timed: Tensor
 
     def __len__(self) -> int:
         return len(self.position)
@@ -88,16 +89,16 @@ def glints(sources: PointSources, rays: list[Rays], spectra: Spectrum) -> Glints
         legs = torch.nn.functional.normalize(stops[:, 1:] - stops[:, :-1], dim=-1)
         cosine = (legs * sources.planes.normals[plane.clamp_min(0)]).sum(-1).abs().double()
         columns = (torch.full_like(one.index, position), one.index, plane, one.points, cosine, one.departure)
-        levels = (_decibels(power / free), _decibels(limit / free), (power > ring) & timely, ~crowded)
+        timed = torch.full_like(crowded, spectrum.delay is not None)
+        levels = (_decibels(power / free), _decibels(limit / free), (power > ring) & timely, ~crowded, timed)
         return [column[kept] for column in (*columns, *levels)]
 
     parts = on_threads(at, [position for position, one in enumerate(rays) if len(one)])
     if not parts:
         none, count = torch.zeros(0), torch.zeros(0, dtype=torch.long)
         rows, level = torch.zeros(0, 3), torch.zeros(0, dtype=torch.float64)
-        return Glints(
-            count, count, rows.long(), torch.zeros(0, 3, 3), rows.double(), rows, level, level, none > 0, none > 0
-        )
+        columns = (count, count, rows.long(), torch.zeros(0, 3, 3), rows.double(), rows)
+        return Glints(*columns, level, level, *(none > 0,) * 3)
     return Glints(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
